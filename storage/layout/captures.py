@@ -248,12 +248,14 @@ class Stack:
         """The frames of a video and what they are used for, as given to `create_stack`."""
         return np.asarray(self._array("shares")[:], np.int64)
 
-    def thumbnails(self) -> NDArray[np.uint16] | None:
-        """The mean values of blocks of `thumbnail_edge` pixels of all frames, (frames, rows, columns), 65535 being full
-        scale; None in captures of earlier versions.
+    def thumbnails(self, frames: NDArray[np.intp] | None = None) -> NDArray[np.uint16] | None:
+        """The mean values of blocks of `thumbnail_edge` pixels of some frames, by default of all, (frames, rows,
+        columns), 65535 being full scale; None in captures of earlier versions.
         """
         (found,) = gather(_optional(self._objects.array(f"{self._path}/thumbnails")))
-        return None if found is None else np.asarray(found[:], np.uint16)
+        if found is None:
+            return None
+        return np.asarray(found[:] if frames is None else found.oindex[frames], np.uint16)
 
     def missing(self) -> list[int]:
         """The slabs that lack a chunk, ascending; lists the store and reads nothing."""

@@ -204,6 +204,7 @@ def test_thumbnails_are_the_means_of_blocks(objects: Objects, dtype: type[np.uns
     unit = frames / top * 65535
     np.testing.assert_allclose(thumbnails[1, 4, 5], unit[1, 12:15, 15:18].mean(), atol=0.5)
     np.testing.assert_allclose(thumbnails[0, 16, 53], unit[0, 48:, 159:].mean(), atol=0.5)
+    np.testing.assert_array_equal(Stack(objects, "c").thumbnails(np.array([1])), thumbnails[[1]])
 
 
 def test_stack_begun_by_an_earlier_version_has_no_thumbnails(

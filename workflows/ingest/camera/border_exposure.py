@@ -7,15 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
+from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.local_gain import Surroundings
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 
-STRIPS, WIDE = 32, 2
+STRIPS, WIDE = 64, 4
 """Strips of the frame that are searched for the border, and how many columns each is wide,"""
 ROWS = 512
 """and the rows of them that are looked at, at most, spread over the frame."""
+AT_ONCE = 8
+"""Strips that are read at a time."""
 ROUNDS = 8
 """Rounds of fitting the light of the border and the exposures, one given the other: without veils, then with them."""
 FOLLOWS = (0.5, 0.7)
@@ -80,21 +83,33 @@ class BorderValues:
         return cls(stack, Program.model_validate(stack.attributes["program"]))
 
     def __init__(self, stack: Stack, program: Program) -> None:
-        left = [int((n + 0.5) * stack.width / STRIPS) for n in range(STRIPS)]
+        left = np.arange(STRIPS) * stack.width // STRIPS
+        columns = np.unique(np.minimum(np.add.outer(left, np.arange(WIDE)), stack.width - 1))
         bits = border_light(range(program.count))[:, stack.attributes["patterns"]]
         self.design = np.concatenate([np.ones((1, stack.frames)), bits]).T
         rows = np.arange(0, stack.height, -(-stack.height // ROWS))
-        columns = np.add.outer(left, np.arange(WIDE)).ravel()
-        codes = stack.read_some(rows, columns).reshape(stack.frames, -1, stack.channels)
-        grey = codes.mean(axis=2, dtype=np.float32)
-        design = self.design.astype(np.float32)
-        _, _, unexplained = _spread(grey, design @ (np.linalg.pinv(design) @ grey), design.shape[1])
-        kept = np.flatnonzero(unexplained < 1 - FOLLOWS[0])
+        parts = np.array_split(columns, STRIPS // AT_ONCE)
+        found = [self._follow(stack, rows, some) for some in parts if some.size]
+        codes, places, whole = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
+        # What hardly varies, as a dark room that compression makes quite black, follows anything.
+        kept = np.flatnonzero(whole[0] > VARIES * whole.max(initial=0))
         kept = kept[:: max(-(-kept.size // MOST_VALUES), 1)]
-        self.codes = codes[:, kept]
-        self.places = np.stack(np.meshgrid(rows, columns, indexing="ij")).reshape(2, -1)[:, kept]
+        self.codes, self.places = codes[:, kept], places[:, kept]
         top = np.iinfo(stack.dtype).max
         self.usable = np.asarray(((self.codes > 0) & (self.codes < SHOULDER * top)).all(axis=2))
+
+    def _follow(
+        self, stack: Stack, rows: NDArray[np.intp], columns: NDArray[np.intp]
+    ) -> tuple[Codes, NDArray[np.intp], NDArray[np.float32]]:
+        """The values at some rows and columns that vary as the bits do: (frames, n, channels), their places (2, n), and
+        their variances (1, n).
+        """
+        codes = stack.read_some(rows, columns).reshape(stack.frames, -1, stack.channels)
+        grey, design = codes.mean(axis=2, dtype=np.float32), self.design.astype(np.float32)
+        whole, _, unexplained = _spread(grey, design @ (np.linalg.pinv(design) @ grey), design.shape[1])
+        kept = np.flatnonzero((unexplained < 1 - FOLLOWS[0]) & (whole > 0))
+        places = np.stack(np.meshgrid(rows, columns, indexing="ij")).reshape(2, -1)
+        return codes[:, kept], places[:, kept], whole[np.newaxis, kept]
 
     def exposures(self, look_up: NDArray[np.float32], local: Surroundings | None = None) -> Doubles | None:
         """The exposure of each frame, as of `fit`."""

@@ -1,7 +1,6 @@
 """Measure the camera from constant frames: its noise, its crosstalk, and unknown tone curves."""
 
 from collections.abc import Callable, Sequence
-from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import CameraCurve, Response, estimate, light_of_codes, table, to_light
 from workflows.ingest.camera.border_exposure import TRIFLE, BorderValues, relative_to_white
 from workflows.ingest.camera.curve import HalfTones, Shown, are_scaled, fit_camera_curve
+from workflows.ingest.camera.lit import find_lit, windows
 from workflows.ingest.local_gain import Surroundings, local_gain
 from workflows.ingest.measured_light import clipped_from, exposures_of
 from workflows.programs.program import Program
@@ -35,6 +35,45 @@ COMPRESSED_SAMPLES = 4096
 """At most how many pixels of all frames the noise of a video is measured from."""
 
 
+class _Sample:
+    """Pixels spread over those that see the monitor, in short runs so that few chunks are read.
+
+    Attributes
+    ----------
+    places : (2, n) intp
+        Their rows and columns.
+    """
+
+    def __init__(self, stack: Stack, seen: NDArray[np.bool_]) -> None:
+        self._stack, self._seen = stack, seen
+        self._squares = windows(seen, int(SAMPLES**0.5) // 4)
+        self.places = np.concatenate([_places(square, seen[square]) for square in self._squares], axis=1)
+
+    def codes(self, frames: list[int]) -> NDArray[Any]:
+        """Values of frames, (frames, n, 3)."""
+        parts = [self._stack.read_frames(frames, *square)[:, self._seen[square]] for square in self._squares]
+        pixels = np.concatenate(parts, axis=1)
+        return np.broadcast_to(pixels, (*pixels.shape[:2], 3))
+
+    def every_frame(self) -> tuple[Codes, NDArray[np.intp]]:
+        """Values of some of the pixels to recover in all frames, (n, frames, channels), and their places, (2, n)."""
+        read = [self._stack.read_masked(*square) for square in self._squares]
+        chosen = [mask & self._seen[square] for square, (_, mask) in zip(self._squares, read, strict=True)]
+        codes = [values[:, some] for (values, _), some in zip(read, chosen, strict=True)]
+        places = [_places(*one) for one in zip(self._squares, chosen, strict=True)]
+        step = -(-sum(len(each[0]) for each in places) // COMPRESSED_SAMPLES) or 1
+        return (
+            np.concatenate(codes, axis=1).transpose(1, 0, 2)[::step],
+            np.concatenate(places, axis=1)[:, ::step],
+        )
+
+
+def _places(square: tuple[slice, slice], chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Rows and columns of the chosen pixels of a square, (2, n)."""
+    places: NDArray[np.intp] = np.stack(np.nonzero(chosen)) + np.array([[part.start] for part in square])
+    return places
+
+
 def measure(
     stack: Stack,
     border: BorderValues | None = None,
@@ -55,17 +94,18 @@ def measure(
         See `workflows.ingest.trial.tone_mapping`.
     """
     program = Program.model_validate(stack.attributes["program"])
-    filmed = _take_squares(stack) if "video" in stack.attributes else None
+    sample = _Sample(stack, find_lit(stack, program))
+    filmed = sample.every_frame() if "video" in stack.attributes else None
     stack.annotate(
         tone_mapping=tone_mapping, clipped_from=_clipped_from(stack, None if filmed is None else filmed[0])
     )
     gain = local_gain(stack)
     frames, sent, exposures = constant_frames(stack, program)
-    codes = np.ascontiguousarray(_sample(stack, frames).transpose(1, 0, 2))
+    codes = np.ascontiguousarray(sample.codes(frames).transpose(1, 0, 2))
     top, black = np.iinfo(stack.dtype).max, stack.attributes["storage"]["black"]
     usable = (codes > 0) & (codes < clipped_from(stack))
     grey = np.ptp(sent, axis=1) == 0
-    camera, exposed, scaled = _camera(stack, program, border, gain)
+    camera, exposed, scaled = _camera(stack, program, sample, border, gain)
     known = "linear" if camera == "unknown" else camera
     found = estimate(
         sent[grey, 0],
@@ -85,7 +125,7 @@ def measure(
     if exposed is not None:
         light /= exposed[[frames[at] for at in shortest], np.newaxis].astype(np.float32)
     if gain is not None:
-        light /= gain.at(*_places(stack))[[frames[at] for at in shortest]].T[..., np.newaxis]
+        light /= gain.at(*sample.places)[[frames[at] for at in shortest]].T[..., np.newaxis]
     if gains is not None:
         shown *= np.array([gains[frames[at]] for at in shortest], np.float32)[:, np.newaxis]
     # Crosstalk between channels must not count as noise, so grey levels are used if there are enough.
@@ -106,7 +146,11 @@ def measure(
 
 
 def _camera(
-    stack: Stack, program: Program, border: BorderValues | None, gain: Surroundings | None
+    stack: Stack,
+    program: Program,
+    sample: _Sample,
+    border: BorderValues | None,
+    gain: Surroundings | None,
 ) -> tuple[CameraCurve | Literal["unknown"], NDArray[np.float64] | None, bool]:
     """The camera's curve, or that of each channel; the exposure of each frame of a film by its border, (frames,), if it
     varied; whether the monitor showed the patterns at another size.
@@ -116,7 +160,7 @@ def _camera(
     camera: CameraCurve | Literal["unknown"]
     camera = TypeAdapter[Response](Response).validate_python(stack.attributes["response"])
     stated = camera != "unknown"
-    halftones = _halftones(stack, program)
+    halftones = _halftones(stack, program, sample)
     exposed: NDArray[np.float64] | None = None
     scaled = False
     for _ in range(TURNS if border else 1):
@@ -146,7 +190,9 @@ def is_free(exposed: NDArray[np.float64] | None) -> bool:
     return exposed is not None and bool(exposed.max() > MOST_APART * exposed.min())
 
 
-def _halftones(stack: Stack, program: Program) -> Callable[[NDArray[np.float64]], HalfTones | None] | None:
+def _halftones(
+    stack: Stack, program: Program, sample: _Sample
+) -> Callable[[NDArray[np.float64]], HalfTones | None] | None:
     """A function from the exposures of all frames to half-tones; None if the program shows none.
 
     It returns None if the exposure was not locked.
@@ -166,9 +212,9 @@ def _halftones(stack: Stack, program: Program) -> Callable[[NDArray[np.float64]]
         return None
     of_light += [frames for frames, _ in there]
     gain = local_gain(stack)
-    local = None if gain is None else np.repeat(gain.at(*_places(stack)), 3, axis=1).astype(np.float64)
-    sample = _sample(stack, np.concatenate(of_light).tolist()).reshape(sum(map(len, of_light)), -1)
-    codes = np.split(sample.astype(np.float32) / full, np.cumsum([len(frames) for frames in of_light])[:-1])
+    local = None if gain is None else np.repeat(gain.at(*sample.places), 3, axis=1).astype(np.float64)
+    values = sample.codes(np.concatenate(of_light).tolist()).reshape(sum(map(len, of_light)), -1)
+    codes = np.split(values.astype(np.float32) / full, np.cumsum([len(frames) for frames in of_light])[:-1])
 
     def seen(exposed: NDArray[np.float64]) -> HalfTones | None:
         used = exposed[np.concatenate(of_light)]
@@ -181,19 +227,6 @@ def _halftones(stack: Stack, program: Program) -> Callable[[NDArray[np.float64]]
         return HalfTones(black, white, tones, [share for _, share in there])
 
     return seen
-
-
-def _take_squares(stack: Stack) -> tuple[Codes, NDArray[np.intp]]:
-    """Values of some of the pixels to recover in all frames, (n, frames, channels), their rows and columns, (2, n)."""
-    squares = list(product(_spread(stack.height), _spread(stack.width)))
-    read = [stack.read_masked(y, x) for y, x in squares]
-    codes = np.concatenate([values[:, mask] for values, mask in read], axis=1).transpose(1, 0, 2)
-    places = [
-        np.stack(np.nonzero(mask)) + np.array([[y.start], [x.start]])
-        for (y, x), (_, mask) in zip(squares, read, strict=True)
-    ]
-    step = -(-len(codes) // COMPRESSED_SAMPLES) or 1
-    return codes[::step], np.concatenate(places, axis=1)[:, ::step]
 
 
 def _clipped_from(stack: Stack, filmed: Codes | None) -> int:
@@ -270,31 +303,6 @@ def constant_frames(
 def _by_value(values: NDArray[Any]) -> NDArray[Any]:
     """Reorder (n, k, 3) to (k, 3 n)."""
     return values.transpose(1, 0, 2).reshape(values.shape[1], -1)
-
-
-def _sample(stack: Stack, frames: list[int]) -> NDArray[Any]:
-    """Values of frames at pixels spread over them, (frames, n, 3), in short runs so that few chunks are read."""
-    rows, columns = (_spread(n) for n in (stack.height, stack.width))
-    parts = [
-        stack.read_frames(frames, y, x).reshape(len(frames), -1, stack.channels)
-        for y in rows
-        for x in columns
-    ]
-    pixels = np.concatenate(parts, axis=1)
-    return np.broadcast_to(pixels, (*pixels.shape[:2], 3))
-
-
-def _places(stack: Stack) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row and column of the pixels of `_sample`."""
-    parts = [np.mgrid[y, x].reshape(2, -1) for y in _spread(stack.height) for x in _spread(stack.width)]
-    y, x = np.concatenate(parts, axis=1)
-    return y, x
-
-
-def _spread(n: int) -> list[slice]:
-    """Up to four short runs spread over n pixels."""
-    length = max(1, min(n // 4, int(SAMPLES**0.5) // 4))
-    return [slice(start, start + length) for start in sorted({n * k // 4 for k in range(4)})]
 
 
 def _as_json(curve: CameraCurve) -> Any:

@@ -30,6 +30,8 @@ LOST = {0.25: 0.087, 0.5: 0.159, 0.75: 0.089}
 CLEARLY = 0.75
 """Half-tones are scaled, and channels have curves of their own, if what is left unexplained is then below this share of
 what is left otherwise."""
+EXPOSED = 2.0
+"""Weight of relative errors of the half-tones' exposures, beside the relative errors of groups of values."""
 SMOOTH = 0.02
 """Weight of the curvature of the slopes; it decides where no value is."""
 DARK = 0.02
@@ -94,7 +96,8 @@ def fit_camera_curve(seen: HalfTones, channels: int = 1) -> Fitted:
     Since pixels differ in brightness, t = 1/2 alone determines F from white down to the darkest. F is that of sRGB with
     its slope multiplied by a piecewise linear function, w >= 0 at the knots, so that F is monotone and the equations
     are linear in w; ``F(1) = 1`` sets the scale. They are solved by non-negative least squares, with a small penalty on
-    the second differences of w. Each equation is a mean over values of about the same white, because noise and dots
+    the second differences of w. The exposure of each half-tone may be off by some per cent: those of a film are only
+    estimated, and light flickers. Each equation is a mean over values of about the same white, because noise and dots
     that the camera partly resolves would otherwise pull towards a curve that hides them.
 
     A page at another zoom, or a player, interpolates between the codes of black and white dots, which are less than
@@ -174,8 +177,8 @@ def _fit(seen: HalfTones) -> _Fit | None:
         kept = used & (off < (furthest or OUTLIER * np.median(off[used])))
         if np.count_nonzero(kept) < MIN_VALUES or np.quantile(white.codes[0, kept], 0.99) < REACH:
             return None
-        equations = _equations(seen, np.flatnonzero(kept))
-        weights, left = _solve(equations @ basis, basis[-1:])
+        equations, brighter = _equations(seen, np.flatnonzero(kept))
+        weights, left = _solve(equations @ basis, brighter, basis[-1:])
         light = np.maximum.accumulate(basis @ weights)
     codes = np.linspace(0, 1, SAMPLES, dtype=np.float32)
     named: list[Curve] = ["linear", "srgb"]
@@ -192,11 +195,13 @@ def _light_of(shown: Shown, light: NDArray[np.floating]) -> NDArray[np.float64]:
     return mean
 
 
-def _equations(seen: HalfTones, kept: NDArray[np.intp]) -> NDArray[np.float64]:
-    """The relative error of each half-tone in each group of values, by the samples of the curve: (k, SAMPLES)."""
+def _equations(seen: HalfTones, kept: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The relative error of each half-tone in each group of values, by the samples of the curve, (k, SAMPLES), and what
+    it grows by with the exposure of each half-tone, (k, tones).
+    """
     black, white, tones, shares = seen
     level = white.codes.mean(axis=0)
-    rows = []
+    rows, brighter = [], []
     for group in np.array_split(kept[np.argsort(level[kept], kind="stable")], BINS):
         bright = to_light(level[group], "srgb").mean() + DARK
         low, high = _mean_at(black, group), _mean_at(white, group)
@@ -204,17 +209,31 @@ def _equations(seen: HalfTones, kept: NDArray[np.intp]) -> NDArray[np.float64]:
             (_mean_at(shown, group) - (1 - share) * low - share * high) / bright
             for shown, share in zip(tones, shares, strict=True)
         ]
-    return np.array(rows)
+        brighter.append(np.diag([to_light(shown.codes[:, group], "srgb").mean() / bright for shown in tones]))
+    return np.array(rows), np.concatenate(brighter)
 
 
-def _solve(rows: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """The weight of each knot, (KNOTS,), from equations and the light at the end, and the length of the residual."""
+def _solve(
+    rows: NDArray[np.float64], brighter: NDArray[np.float64], end: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """The weight of each knot, (KNOTS,), from equations, what exposures change in them, and the light at the end; and
+    the length of the residual.
+    """
     from scipy.optimize import nnls  # takes half a second to import
 
+    tones = brighter.shape[1]
     curved = SMOOTH * np.sqrt(len(rows) / KNOTS) * np.diff(np.eye(KNOTS), 2, axis=0)
-    A = np.concatenate([rows, curved, 1e3 * end])
+    exposed = np.concatenate([brighter, -brighter], axis=1)  # of either sign
+    A = np.block(
+        [
+            [rows, exposed],
+            [curved, np.zeros((len(curved), 2 * tones))],
+            [np.zeros((2 * tones, KNOTS)), EXPOSED * np.eye(2 * tones)],
+            [1e3 * end, np.zeros((1, 2 * tones))],
+        ]
+    )
     weights, left = nnls(A, np.concatenate([np.zeros(len(A) - 1), [1e3]]))
-    return weights, float(left)
+    return weights[:KNOTS], float(left)
 
 
 def _basis() -> NDArray[np.float64]:

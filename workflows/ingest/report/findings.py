@@ -280,7 +280,7 @@ def _noise(figures: Figures, attributes: dict[str, Any], cost: float) -> list[Fi
         remedy=""
         if level == "good"
         else "expose longer at a lower ISO, take several frames of each pattern, make the monitor brighter or the room "
-        "darker; or leave pixels that see no monitor out of the mask",
+        "darker",
     )
     return [found]
 

@@ -1,7 +1,8 @@
-"""Measure how a capture turned out: clipping, exposure, contrast and steadiness, in windows of its frames."""
+"""Measure how a capture turned out: clipping, exposure and contrast, in windows of its frames where these see the
+monitor.
+"""
 
 from collections.abc import Iterator
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import constant_frames, measure
+from workflows.ingest.camera.lit import find_lit, windows
 from workflows.ingest.local_gain import Places, local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
 from workflows.ingest.report.colour_detail import ColourDetail
@@ -19,7 +21,7 @@ from workflows.programs.program import Program
 from workflows.recovery.camera.noise import Noise
 
 EDGE = 96
-"""Largest side of a window in pixels. Four by four windows are spread over the frame."""
+"""Largest side of a window in pixels. Four by four windows are spread over what sees the monitor."""
 FRAMES = 2000
 """Frames that are examined, at most, spread over the capture."""
 COLOUR_FRAMES = 16
@@ -68,14 +70,14 @@ def survey(stack: Stack, border: BorderValues | None = None) -> None:
     brightest: list[NDArray[np.float32]] = []
     lit = np.zeros((2, len(tones)))  # of half-tones times white, of white squared
     detail, gain = ColourDetail(), local_gain(stack)
-    pixels = 0
+    pixels, seen = 0, find_lit(stack, program)
 
     def evened(codes: Codes, frame: int, y: Places, x: Places) -> NDArray[np.float32]:
         light = even_out(light_of_codes(codes, look_up).mean(axis=2), frame, attributes)
         return light if gain is None else light / gain.at(y, x, frame).reshape(light.shape)
 
-    for rows, columns in _windows(stack):
-        wanted = stack.mask(rows, columns)
+    for rows, columns in windows(seen, EDGE):
+        wanted = stack.mask(rows, columns) & seen[rows, columns]
         if not wanted.any():
             continue
         y, x = np.mgrid[rows, columns].reshape(2, -1)
@@ -138,14 +140,6 @@ def _halftone_frames(stack: Stack, program: Program) -> list[tuple[int, float]]:
 
 def _percentile(values: list[NDArray[np.float32]], q: float) -> float:
     return float(np.percentile(np.concatenate(values), q)) if values else 0.0
-
-
-def _windows(stack: Stack) -> Iterator[tuple[slice, slice]]:
-    def spread(n: int) -> list[slice]:
-        length = min(EDGE, max(1, -(-n // 4)))
-        return [slice(start, start + length) for start in sorted({(n - length) * k // 3 for k in range(4)})]
-
-    return product(spread(stack.height), spread(stack.width))
 
 
 def _batches(

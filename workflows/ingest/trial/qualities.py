@@ -73,7 +73,7 @@ def try_qualities(stack: Stack, sample: Sample, patterns: Patterns) -> dict[str,
     seen, places = see_sample(stack, tried, shifts), tried.places.T
     # For an interval, pixels from all over the glass count for more than the neighbours that a recovery starts from.
     spread = see_sample(stack, sample.thinned(PIXELS), shifts)
-    share = float(np.count_nonzero(stack.mask()) / len(places))
+    share = sample.wanted / len(places)
     random = [part for part in program.parts if isinstance(part, Bernoulli)]
     # Each of a few stripes tells what no other does: without it, predictions would be far worse than with it.
     step = max(HELD_OUT if random else 1, patterns.count // MOST_HELD_OUT)

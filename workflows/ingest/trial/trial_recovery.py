@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import Curve, to_light
+from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import (
     LOBES,
@@ -72,7 +73,9 @@ class Sample(NamedTuple):
     chosen : three (n,) intp
         Square, row and column of each pixel, counted without the margins.
     every : three (k,) intp
-        All pixels of the squares that are to be recovered, likewise.
+        All pixels of the squares that are to be recovered, and see the monitor, likewise.
+    wanted : int
+        How many pixels of the whole frame are and do.
     corners : (squares, 2) intp
         Row and column in the frame of the first pixel of each square.
     """
@@ -80,6 +83,7 @@ class Sample(NamedTuple):
     codes: Codes
     chosen: tuple[NDArray[np.intp], ...]
     every: tuple[NDArray[np.intp], ...]
+    wanted: int
     corners: NDArray[np.intp]
 
     @property
@@ -126,8 +130,10 @@ class Trial(NamedTuple):
 
 
 def take_sample(stack: Stack) -> Sample | None:
-    """Choose squares spread over the pixels to recover, and pixels in them; None if there are too few."""
-    wanted = stack.mask()
+    """Choose squares spread over the pixels to recover that see the monitor, and pixels in them; None if there are too
+    few.
+    """
+    wanted = stack.mask() & find_lit(stack, Program.model_validate(stack.attributes["program"]))
     down, across = (np.arange(_MARGIN, size - _MARGIN - EDGE + 1, EDGE) for size in wanted.shape)
     corners = [(y, x) for y in down.tolist() for x in across.tolist()]
     counts = np.array([np.count_nonzero(wanted[y : y + EDGE, x : x + EDGE]) for y, x in corners], int)
@@ -142,7 +148,8 @@ def take_sample(stack: Stack) -> Sample | None:
     inside = np.stack([wanted[y : y + EDGE, x : x + EDGE] for y, x in corners])
     every = np.nonzero(inside)
     limit = max(min(PIXELS, VALUES // stack.frames), MIN_PIXELS)
-    whole = Sample(np.stack(squares, axis=1), every, every, np.array(corners, np.intp))
+    count = int(np.count_nonzero(wanted))
+    whole = Sample(np.stack(squares, axis=1), every, every, count, np.array(corners, np.intp))
     return whole.thinned(limit)
 
 

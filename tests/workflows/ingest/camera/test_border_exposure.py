@@ -23,7 +23,7 @@ LOOK_UP = table("srgb", np.dtype(np.uint16))
 class Film:
     """What `BorderValues` needs of a stack: the border around a picture that changes at random."""
 
-    channels, height, width = 3, 60, 80
+    channels = 3
 
     def __init__(
         self,
@@ -33,6 +33,7 @@ class Film:
         veil: NDArray[np.floating] | float = 0.0,
         between: bool = False,
         clipped: bool = False,
+        dark: int = 0,
     ) -> None:
         random = np.random.default_rng(2)
         self.frames = PROGRAM.count - missing
@@ -51,6 +52,9 @@ class Film:
         light += 0.002 * random.standard_normal(light.shape)
         self.dtype = np.dtype(np.uint16)
         self.codes = np.interp(light, LOOK_UP, np.arange(65536)).round().astype(np.uint16)
+        # A room so dark that compression has made it black.
+        self.codes = np.pad(self.codes, ((0, 0), (dark, dark), (dark, dark), (0, 0)))
+        self.height, self.width = self.codes.shape[1:3]
 
     def read_some(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.uint16]:
         return self.codes[:, rows][:, :, columns]
@@ -63,6 +67,17 @@ def test_exposures_are_followed_by_the_border(missing: int) -> None:
     assert found is not None
     true = drift[: PROGRAM.count - missing]
     np.testing.assert_allclose(found, true / np.median(true), rtol=0.02)
+
+
+def test_the_border_is_found_in_a_dark_room() -> None:
+    drift = np.exp(0.1 * np.sin(np.arange(PROGRAM.count)))
+    film = Film(drift, dark=200)
+    values = BorderValues(film, PROGRAM)  # type: ignore[arg-type]
+    y, x = values.places - 200
+    assert ((y >= 0) & (y < 60) & (x >= 0) & (x < 80)).all()
+    found = values.exposures(LOOK_UP)
+    assert found is not None
+    np.testing.assert_allclose(found, drift / np.median(drift), rtol=0.02)
 
 
 def test_veil_of_bright_patterns_is_no_exposure() -> None:

@@ -87,6 +87,13 @@ def test_exposures_that_changed_are_evened_out() -> None:
     assert fit(seen("srgb", 0.002, exposures)) != "srgb"
 
 
+def test_an_error_of_one_exposure_hardly_changes_the_curve() -> None:
+    found = fit(seen("contrasty", 0.003, (1.0, 1.0, 1.0, 1.0, 1.03)))
+    light = np.linspace(0.02, 0.8, 50, dtype=np.float32)
+    back = to_light(encoded(light, "contrasty"), found)  # type: ignore[arg-type]
+    np.testing.assert_allclose(back / (back @ light) * (light @ light), light, atol=0.006)
+
+
 def test_pixels_that_do_not_follow_the_half_tones_are_left_out() -> None:
     codes = seen("contrasty")
     random = np.random.default_rng(5)

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
-from tests.parts.captures import nested_program
+from tests.parts.captures import captured, nested_program
 from workflows.images.integer_formats import decode, encode_png
 from workflows.images.tone_curves import to_light
 from workflows.ingest.report.findings import Finding
@@ -69,6 +69,29 @@ def test_good_capture_has_no_warnings(ingest: Ingest, capture_archive: bytes) ->
     assert made.white_reaches == pytest.approx(0.86, abs=0.03)
     assert made.noise.black == pytest.approx(255 * 0.0025, rel=0.4)
     assert "no difference to black and white" in found["monitor_curve"].message
+
+
+@pytest.mark.slow
+def test_a_dark_room_around_the_monitor_changes_little(ingest: Ingest) -> None:
+    """Black pixels in which nothing changes are without noise, and never lit."""
+    scene, program = glass_ball(80, 60, monitor=(320, 240), rays=4), preset("quick", 320, 240)
+    pictures = list(program.pictures(0, program.count))
+    random = np.random.default_rng(3)
+    seen = [0.03 + 0.8 * scene.composite(picture) for picture in pictures]
+    seen = [light + 0.004 * random.standard_normal(light.shape) for light in seen]
+
+    def within(room: int) -> tuple[Report, dict[str, float]]:
+        stack = ingest(
+            "c", captured(program, lambda n, _: np.pad(seen[n], ((room, room), (room, room), (0, 0))))
+        )
+        made = report(stack.attributes, stack.frames)
+        assert made.quality is not None
+        return made, {"noise": made.noise.full, "low": made.quality.low}
+
+    alone, dark = within(0), within(60)
+    assert dark[1] == pytest.approx(alone[1], rel=0.05)
+    assert dark[0].clipping.black < 0.02
+    assert dark[0].level == alone[0].level
 
 
 @pytest.mark.slow

@@ -96,7 +96,7 @@ export const de = {
 	"expect composites of about {low} dB ({worst}) to {high} dB ({best}), if nothing else is wrong": "Montagen erreichen etwa {low} dB ({worst}) bis {high} dB ({best}), wenn sonst alles stimmt",
 	"expect composites of about {low} dB, if nothing else is wrong": "Montagen erreichen etwa {low} dB, wenn sonst alles stimmt",
 	"export the matte again": "die Matte noch einmal exportieren",
-	"expose longer at a lower ISO, take several frames of each pattern, make the monitor brighter or the room darker; or leave pixels that see no monitor out of the mask": "länger bei kleinerer ISO belichten, mehrere Bilder je Muster aufnehmen, den Monitor heller oder den Raum dunkler machen; oder Pixel, die keinen Monitor sehen, aus der Maske lassen",
+	"expose longer at a lower ISO, take several frames of each pattern, make the monitor brighter or the room darker": "länger bei kleinerer ISO belichten, mehrere Bilder je Muster aufnehmen, den Monitor heller oder den Raum dunkler machen",
 	"expose {less} less, or add frames of a shorter exposure": "{less} knapper belichten oder kürzer belichtete Bilder hinzufügen",
 	"expose {more} more": "{more} reichlicher belichten",
 	"failed": "fehlgeschlagen",

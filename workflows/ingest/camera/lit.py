@@ -1,0 +1,58 @@
+"""Which pixels see the monitor: the others, of a dark room, tell nothing of the camera or of the glass."""
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.layout.captures import Stack, thumbnail_edge
+from workflows.images.tone_curves import Curve, to_light
+from workflows.ingest.measured_light import exposures_of
+from workflows.programs.program import Program
+
+SHARE = 0.03
+"""Difference of a white and a black monitor from which on a pixel sees it, as a share of the brightest pixels'."""
+BRIGHTEST = 0.98
+"""The quantile of the pixels to be recovered that tells how bright these are."""
+
+
+def find_lit(stack: Stack, program: Program) -> NDArray[np.bool_]:
+    """Which pixels see the monitor, (y, x).
+
+    All do in captures of earlier versions, and where no pixel to be recovered is brighter before a white monitor.
+
+    Notes
+    -----
+    By the means of blocks of pixels, in the shortest exposure. It is the least that white exceeds black by in any two
+    frames that counts, since the border of a film differs between them. Codes of an unknown curve are taken as sRGB.
+    """
+    every = np.ones((stack.height, stack.width), bool)
+    patterns, exposures = stack.attributes["patterns"], exposures_of(stack.attributes)
+    numbers, sent = program.constants_among(patterns)
+    level = sent.sum(axis=1)
+    black, white = (
+        stack.thumbnails(np.flatnonzero(np.isin(patterns, numbers[level == end]) & (exposures == 1)))
+        for end in (level.min(), level.max())
+    )
+    if black is None or white is None or not len(black) or not len(white):
+        return every
+    curve: Curve = "linear" if stack.attributes["response"] == "linear" else "srgb"
+    dark, bright = (to_light(part.astype(np.float32) / np.float32(65535), curve) for part in (black, white))
+    exceeds = bright.min(axis=0) - dark.max(axis=0)
+    edge = thumbnail_edge(stack.height, stack.width)
+    found = exceeds.repeat(edge, axis=0).repeat(edge, axis=1)[: stack.height, : stack.width]
+    brightest = np.quantile(found[stack.mask()], BRIGHTEST)
+    return np.asarray(found > SHARE * brightest) if brightest > 0 else every
+
+
+def windows(seen: NDArray[np.bool_], edge: int) -> list[tuple[slice, slice]]:
+    """Up to four by four rectangles, of ``edge`` pixels a side at most, spread over all that is seen, (y, x)."""
+
+    def spread(some: NDArray[np.bool_]) -> list[slice]:
+        first, last = np.flatnonzero(some)[[0, -1]].tolist()
+        size = last + 1 - first
+        length = min(edge, -(-size // 4))
+        starts = {first + (size - length) * k // 3 for k in range(4)}
+        return [slice(start, start + length) for start in sorted(starts)]
+
+    return list(product(spread(np.any(seen, axis=1)), spread(np.any(seen, axis=0))))
