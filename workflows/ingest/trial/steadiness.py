@@ -14,6 +14,7 @@ from workflows.ingest.camera.border_exposure import BorderLight, BorderValues, s
 from workflows.ingest.camera.calibration import is_free, measure
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import black_patterns, look_up_of
+from workflows.ingest.trial.movement import smooth_path
 from workflows.ingest.trial.tone_mapping import find_tone_mapping
 from workflows.ingest.trial.trial_recovery import (
     FURTHEST,
@@ -91,10 +92,11 @@ def find_steadiness(
     -----
     T is recovered for some pixels as if nothing had moved. The difference between frame n and its prediction is then
     fitted by ``d_n . grad C + a_n rho T L`` over these pixels, with Huber weights; -d_n is the shift and 1 + a_n the
-    gain of the frame. T has absorbed part of a disturbance, most of all of a slow drift, since coarse and fine patterns
-    are shown one after another. So the frames are corrected, T is recovered again, and so on; each round extrapolates
-    from the last few (Anderson acceleration). Constant frames have no structure to locate them by, and get the shift of
-    the frames before and after.
+    gain of the frame. Shifts are smoothed to a likely path (`workflows.ingest.trial.movement`). T has absorbed part of
+    a disturbance, most of all of a slow drift, since coarse and fine patterns are shown one after another. So the
+    frames are corrected, T is recovered again, and so on; each round extrapolates from the last few (Anderson
+    acceleration). Constant frames have no structure to locate them by, and get the shift of the frames before and
+    after.
 
     PSNR of composites in dB, uncorrected and corrected, for a ball of 4,300 pixels with a blur of half a pixel and the
     noise of `Scene.film`:
@@ -142,7 +144,7 @@ def find_steadiness(
     shown = np.isin(patterns, program.measured)
     if np.count_nonzero(np.isfinite(first.off[shown]).all(axis=1)) < MIN_FRAMES:
         return through
-    found, last = _fill_gaps(first.off, shown), first
+    found, last = _fill_gaps(first, shown), first
     moves = flickers = False
     believed = np.ones(2, bool)
     least = np.array([MIN_DRIFT, MIN_FLICKER])
@@ -166,7 +168,7 @@ def find_steadiness(
         return through
     if not moves and not flickers:
         # The first trial underestimates, but later rounds may have diverged.
-        found, last = _fill_gaps(first.off, shown), first
+        found, last = _fill_gaps(first, shown), first
     gain = np.exp(found[:, 2] - np.median(found[shown, 2]))
     drift = _drift(found[shown, :2], last.error[shown, :2]) | {"corrected": moves}
     mean = (
@@ -260,7 +262,7 @@ def _settle(
     tried: list[tuple[Doubles, Trial]] = []
     diverged = 0
     for _ in range(ROUNDS):
-        step = _fill_gaps(trial.off, shown) * free
+        step = _fill_gaps(trial, shown) * free
         states.append(state * scale)
         steps.append(step * scale)
         ahead = states[-1] + steps[-1]
@@ -278,7 +280,7 @@ def _settle(
         if again is None:
             break
         state, trial = ahead, again
-        left = _fill_gaps(trial.off, shown)
+        left = _fill_gaps(trial, shown)
         if _size(left[shown, :2]) < SETTLED[0] and _size(left[shown, 2:]) < SETTLED[1]:
             return state, trial, left
         tried.append((state, trial))
@@ -286,18 +288,20 @@ def _settle(
         if diverged == DIVERGED:
             break
     state, trial = min(tried, key=lambda one: one[1].residual, default=(state, trial))
-    return state, trial, _fill_gaps(trial.off, shown)
+    return state, trial, _fill_gaps(trial, shown)
 
 
-def _fill_gaps(off: Doubles, shown: NDArray[np.bool_]) -> Doubles:
+def _fill_gaps(trial: Trial, shown: NDArray[np.bool_]) -> Doubles:
     """The shift and gain of each frame; missing shifts are interpolated from other frames, missing gains are 1.
 
-    Shifts are relative to the mean position of the patterns, gains to those of the constant frames.
+    Shifts are those of a likely path, relative to the mean position of the patterns, gains to those of the constant
+    frames.
     """
-    filled = off.copy()
-    known = np.flatnonzero(shown & np.isfinite(off).all(axis=1))
+    filled = trial.off.copy()
+    known = np.flatnonzero(shown & np.isfinite(filled).all(axis=1))
+    path = smooth_path(trial.off[known, :2], trial.error[known, :2])
     for axis in range(2):
-        filled[:, axis] = np.interp(np.arange(len(off)), known, off[known, axis])
+        filled[:, axis] = np.interp(np.arange(len(filled)), known, path[:, axis])
     filled[:, :2] -= filled[shown, :2].mean(axis=0)
     return np.nan_to_num(filled)
 
@@ -308,10 +312,15 @@ def _size(values: Doubles) -> float:
 
 
 def _sizes(found: Doubles, trial: Trial, shown: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
-    """Size of the drift and of the flicker, root mean square, and their standard errors."""
-    error = trial.error[shown & np.isfinite(trial.error).all(axis=1)]
+    """Size of the drift and of the flicker, root mean square, and the standard errors of most frames."""
+    error = trial.error[shown]
     size = np.array([_size(found[shown, :2]), found[shown, 2].std()])
-    return size, np.array([_size(error[:, :2]), _size(error[:, 2:])])
+    return size, np.array([_usual(error[:, :2]), _usual(error[:, 2:])])
+
+
+def _usual(errors: Doubles) -> float:
+    """The median length of rows without gaps."""
+    return float(np.median(np.linalg.norm(errors[np.isfinite(errors).all(axis=1)], axis=1)))
 
 
 def _within(found: Doubles, shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -325,7 +334,7 @@ def _drift(places: Doubles, error: Doubles) -> dict[str, Any]:
     along = places @ np.stack([np.cos(angle), np.sin(angle)])
     return {
         "pixels": float(np.ptp(along, axis=0).max()),
-        "error": _size(error[np.isfinite(error).all(axis=1)]),
+        "error": _usual(error),
         "quarters": [part.mean(axis=0).round(3).tolist() for part in np.array_split(places, QUARTERS)],
     }
 
