@@ -101,8 +101,9 @@ def test_there_is_a_draft_while_stills_come_and_at_last_the_matte_of_all(
     capture = service.client.capture(str(made.capture))
     assert (capture.frames, capture.name) == (program.count, "tethered")
     backdrop = np.full((4, 4, 3), 0.5, np.float32)
-    np.testing.assert_array_equal(
-        service.client.composite(made, backdrop), service.client.composite(matte, backdrop)
+    # Not quite the same: whoever uploads a capture states its curve, here it is found.
+    np.testing.assert_allclose(
+        service.client.composite(made, backdrop), service.client.composite(matte, backdrop), atol=0.005
     )
 
 
