@@ -73,9 +73,9 @@ class Sample(NamedTuple):
     chosen : three (n,) intp
         Square, row and column of each pixel, counted without the margins.
     every : three (k,) intp
-        All pixels of the squares that are to be recovered, and see the monitor, likewise.
+        All pixels of the squares that are to be recovered and see the monitor, likewise.
     wanted : int
-        How many pixels of the whole frame are and do.
+        Pixels of the whole frame that are to be recovered and see the monitor.
     corners : (squares, 2) intp
         Row and column in the frame of the first pixel of each square.
     """
