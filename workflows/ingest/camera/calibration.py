@@ -59,13 +59,12 @@ class _Sample:
         """Values of some of the pixels to recover in all frames, (n, frames, channels), and their places, (2, n)."""
         read = [self._stack.read_masked(*square) for square in self._squares]
         chosen = [mask & self._seen[square] for square, (_, mask) in zip(self._squares, read, strict=True)]
-        codes = [values[:, some] for (values, _), some in zip(read, chosen, strict=True)]
-        places = [_places(*one) for one in zip(self._squares, chosen, strict=True)]
-        step = -(-sum(len(each[0]) for each in places) // COMPRESSED_SAMPLES) or 1
-        return (
-            np.concatenate(codes, axis=1).transpose(1, 0, 2)[::step],
-            np.concatenate(places, axis=1)[:, ::step],
-        )
+        codes = np.concatenate(
+            [values[:, some] for (values, _), some in zip(read, chosen, strict=True)], axis=1
+        ).transpose(1, 0, 2)
+        places = np.concatenate([_places(*one) for one in zip(self._squares, chosen, strict=True)], axis=1)
+        step = -(-len(codes) // COMPRESSED_SAMPLES) or 1
+        return codes[::step], places[:, ::step]
 
 
 def _places(square: tuple[slice, slice], chosen: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -13,7 +13,7 @@ from workflows.programs.program import Program
 SHARE = 0.03
 """Difference of a white and a black monitor from which on a pixel sees it, as a share of the brightest pixels'."""
 BRIGHTEST = 0.98
-"""The quantile of the pixels to be recovered that tells how bright these are."""
+"""The quantile of the blocks with pixels to be recovered that tells how bright these are."""
 
 
 def find_lit(stack: Stack, program: Program) -> NDArray[np.bool_]:
@@ -40,9 +40,13 @@ def find_lit(stack: Stack, program: Program) -> NDArray[np.bool_]:
     dark, bright = (to_light(part.astype(np.float32) / np.float32(65535), curve) for part in (black, white))
     exceeds = bright.min(axis=0) - dark.max(axis=0)
     edge = thumbnail_edge(stack.height, stack.width)
-    found = exceeds.repeat(edge, axis=0).repeat(edge, axis=1)[: stack.height, : stack.width]
-    brightest = np.quantile(found[stack.mask()], BRIGHTEST)
-    return np.asarray(found > SHARE * brightest) if brightest > 0 else every
+    down, across = (np.arange(0, size, edge) for size in (stack.height, stack.width))
+    wanted = np.logical_or.reduceat(np.logical_or.reduceat(stack.mask(), down, axis=0), across, axis=1)
+    brightest = np.quantile(exceeds[wanted], BRIGHTEST)
+    if brightest <= 0:
+        return every
+    seen: NDArray[np.bool_] = exceeds > SHARE * brightest
+    return seen.repeat(edge, axis=0)[: stack.height].repeat(edge, axis=1)[:, : stack.width]
 
 
 def windows(seen: NDArray[np.bool_], edge: int) -> list[tuple[slice, slice]]:
