@@ -181,12 +181,12 @@ def _camera(
     return camera, exposed, scaled
 
 
-def is_free(exposed: NDArray[np.float64] | None) -> bool:
+def is_free(exposed: Sequence[float] | NDArray[np.float64] | None) -> bool:
     """Whether the exposure of a film was not locked.
 
     Then errors of the exposures make more values brighter than white than noise does.
     """
-    return exposed is not None and bool(exposed.max() > MOST_APART * exposed.min())
+    return exposed is not None and bool(np.max(exposed) > MOST_APART * np.min(exposed))
 
 
 def _halftones(

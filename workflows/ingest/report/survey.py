@@ -52,7 +52,9 @@ def survey(stack: Stack, border: BorderValues | None = None) -> None:
     patterns = np.array(attributes["patterns"])
     frames, sent, times = constant_frames(stack, program)
     level = sent.mean(axis=1) + np.where(times == times.min(), 0, np.nan)
-    white, black = frames[int(np.nanargmax(level))], frames[int(np.nanargmin(level))]
+    # Where the exposure varied, the white frame that clips least.
+    exposed = np.array(attributes["auto_exposure"] or np.ones(stack.frames))[frames]
+    white, black = frames[int(np.lexsort((exposed, -level))[0])], frames[int(np.nanargmin(level))]
     noise = Noise(**attributes["noise"])
     tones = [] if attributes["scaled"] else _halftone_frames(stack, program)
     special = [black, white, *(frame for frame, _ in tones)]

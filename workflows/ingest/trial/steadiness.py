@@ -25,6 +25,7 @@ from workflows.ingest.trial.trial_recovery import (
     try_recovery,
 )
 from workflows.ingest.trial.unexplained import Unexplained, find_unexplained
+from workflows.ingest.trial.white_exposure import find_white_excess
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.sensing import Patterns
@@ -96,7 +97,8 @@ def find_steadiness(
     a disturbance, most of all of a slow drift, since coarse and fine patterns are shown one after another. So the
     frames are corrected, T is recovered again, and so on; each round extrapolates from the last few (Anderson
     acceleration). Constant frames have no structure to locate them by, and get the shift of the frames before and
-    after.
+    after. If the exposure was free, one gain of all patterns is found in place of each frame's
+    (`workflows.ingest.trial.white_exposure`).
 
     PSNR of composites in dB, uncorrected and corrected, for a ball of 4,300 pixels with a blur of half a pixel and the
     noise of `Scene.film`:
@@ -136,67 +138,75 @@ def find_steadiness(
     if sample is None or explained is None:
         return None
     monitor, light, unexplained = explained
-    at_rest = np.zeros((stack.frames, 3))
+    begin = np.zeros((stack.frames, 3))
     at_first, through, _ = unexplained
-    first = measure_rest(stack, program, monitor, through, sample, at_rest, at_first)
+    at_rest = measure_rest(stack, program, monitor, through, sample, begin, at_first)
     try_out = partial(try_recovery, stack, program, monitor, through, sample)
     patterns = np.array(stack.attributes["patterns"])
     shown = np.isin(patterns, program.measured)
-    if np.count_nonzero(np.isfinite(first.off[shown]).all(axis=1)) < MIN_FRAMES:
+    if np.count_nonzero(np.isfinite(at_rest.off[shown]).all(axis=1)) < MIN_FRAMES:
         return through
-    found, last = _fill_gaps(first, shown), first
+    first, has_black = at_rest, bool(np.isin(black_patterns(program), patterns).any())
+    free = is_free(stack.attributes["auto_exposure"])
+    if free:
+        begin[shown, 2] = find_white_excess(stack, program, monitor, light)
+        first = try_out(begin) or at_rest
+        # Most of what is lit is clipped: the gain of a frame is less exact than its exposure by the border.
+        first = first._replace(off=first.off * [1, 1, 0])
+    found, last = begin + _fill_gaps(first, shown), first
     moves = flickers = False
     believed = np.ones(2, bool)
     least = np.array([MIN_DRIFT, MIN_FLICKER])
     size, error = _sizes(found, first, shown)
     if ((size > TRIFLE * least) & (size > LOOK_AGAIN * error)).any():
-        has_black = bool(np.isin(black_patterns(program), patterns).any())
-        found, last, left = _settle(try_out, first, shown, has_black)
+        found, last, left = _settle(try_out, begin, first, shown, has_black and not free)
         size, error = _sizes(found, last, shown)
         there = (size >= least) & (size >= SURE * error)
         sure = there & (_sizes(left, last, shown)[0] <= REST * size) & _within(found, shown)
-        believed = _believed(first.residual, last.residual)
+        believed = _believed(at_rest.residual, last.residual)
         moves = bool(sure[0] and believed[0])
         # Movement that is not a common shift looks like flicker.
-        flickers = bool(sure[1] and believed[1] and has_black and (moves or not there[0]))
-    if (
-        not moves
-        and not flickers
-        and (last.residual > EXPLAINED[0] or (last is not first and not believed.any()))
-    ):
+        flickers = bool(sure[1] and believed[1] and has_black and not free and (moves or not there[0]))
+    is_known = last.residual <= EXPLAINED[0] and (last is first or bool(believed.any()))
+    corrected = np.concatenate([found[:, :2] * moves, (found if flickers else begin)[:, 2:]], axis=1)
+    if moves or flickers or is_known:
+        if not moves and not flickers:
+            # The first trial underestimates, but later rounds may have diverged.
+            found, last = begin + _fill_gaps(first, shown), first
+        gain = np.exp(found[:, 2] - np.median(found[shown, 2]))
+        drift = _drift(found[shown, :2], last.error[shown, :2]) | {"corrected": moves}
+        mean = (
+            light.code[light.pyramid.starts[-2] :]
+            .reshape(-1, light.channels, program.measured.size)
+            .mean(axis=(0, 1))
+        )
+        bright = mean[np.searchsorted(program.measured, patterns[shown])]
+        flicker = _flicker(gain, last.error[:, 2], np.flatnonzero(shown), bright) | {"corrected": flickers}
+        # A drift or flicker beyond the limits of the search is something else.
+        within = _within(found, shown)
+        stack.annotate(
+            steadiness={
+                "drift": drift if within[0] else None,
+                "flicker": flicker if within[1] and not free else None,
+            }
+        )
+    else:
         stack.annotate(steadiness={})
+    if not corrected.any():
         return through
-    if not moves and not flickers:
-        # The first trial underestimates, but later rounds may have diverged.
-        found, last = _fill_gaps(first, shown), first
-    gain = np.exp(found[:, 2] - np.median(found[shown, 2]))
-    drift = _drift(found[shown, :2], last.error[shown, :2]) | {"corrected": moves}
-    mean = (
-        light.code[light.pyramid.starts[-2] :]
-        .reshape(-1, light.channels, program.measured.size)
-        .mean(axis=(0, 1))
-    )
-    bright = mean[np.searchsorted(program.measured, patterns[shown])]
-    flicker = _flicker(gain, last.error[:, 2], np.flatnonzero(shown), bright) | {"corrected": flickers}
-    # A drift or flicker beyond the limits of the search is something else.
-    within = _within(found, shown)
-    stack.annotate(
-        steadiness={"drift": drift if within[0] else None, "flicker": flicker if within[1] else None},
-        **({"shifts": found[:, :2].round(4).tolist()} if moves else {}),
-        **(
-            {"gains": (gain / unit_of(gain, stack.attributes, program)).round(5).tolist()} if flickers else {}
-        ),
-    )
-    if not moves and not flickers:
-        return through
-    again = find_unexplained(stack, program, monitor, light, sample, found * [moves, moves, flickers])
+    if moves:
+        stack.annotate(shifts=corrected[:, :2].round(4).tolist())
+    if corrected[:, 2].any():
+        gain = np.exp(corrected[:, 2] - np.median(corrected[shown, 2]))
+        stack.annotate(gains=(gain / unit_of(gain, stack.attributes, program)).round(5).tolist())
+    again = find_unexplained(stack, program, monitor, light, sample, corrected)
     return again and again.patterns
 
 
 def unit_of(gain: Doubles, attributes: dict[str, Any], program: Program) -> float:
     """The gain that counts as 1: that of the patterns, or of the white frame in whose units a free exposure is."""
     exposed = attributes["auto_exposure"]
-    if exposed is None or not is_free(np.array(exposed)):
+    if not is_free(exposed):
         return 1.0
     white = shortest_white(np.array(exposed), attributes["patterns"], program)
     return 1.0 if white is None else float(gain[white])
@@ -242,21 +252,25 @@ def _border_light(stack: Stack, border: BorderValues | None) -> BorderLight | No
 
     One that was not follows the patterns, as local tone mapping does, and errors of the curve hide the latter.
     """
-    exposed = stack.attributes["auto_exposure"]
-    if border is None or (exposed is not None and is_free(np.array(exposed))):
+    if border is None or is_free(stack.attributes["auto_exposure"]):
         return None
     return border.fit(look_up_of(stack), local_gain(stack))
 
 
 def _settle(
-    try_out: Callable[[Doubles], Trial | None], trial: Trial, shown: NDArray[np.bool_], has_black: bool
+    try_out: Callable[[Doubles], Trial | None],
+    begin: Doubles,
+    trial: Trial,
+    shown: NDArray[np.bool_],
+    has_black: bool,
 ) -> tuple[Doubles, Trial, Doubles]:
-    """Correct and measure again until little is left; returns what was found, the trial of it, and what that left.
+    """Correct and measure again, from a beginning and the trial of it, until little is left; returns what was found,
+    the trial of it, and what that left.
 
     Where more is left whatever is done, later rounds wander: then it is the round that explains the frames best.
     """
     scale, free = np.array([1, 1, SETTLED[0] / SETTLED[1]]), np.array([1, 1, int(has_black)])
-    state = np.zeros_like(trial.off)
+    state = begin
     states: list[Doubles] = []
     steps: list[Doubles] = []
     tried: list[tuple[Doubles, Trial]] = []

@@ -129,11 +129,13 @@ class Trial(NamedTuple):
     residual: float
 
 
-def take_sample(stack: Stack) -> Sample | None:
+def take_sample(stack: Stack, masked: bool = True) -> Sample | None:
     """Choose squares spread over the pixels to recover that see the monitor, and pixels in them; None if there are too
-    few.
+    few. Unless ``masked``, all that see the monitor are taken for those to recover.
     """
-    wanted = stack.mask() & find_lit(stack, Program.model_validate(stack.attributes["program"]))
+    wanted = find_lit(stack, Program.model_validate(stack.attributes["program"]))
+    if masked:
+        wanted &= stack.mask()
     down, across = (np.arange(_MARGIN, size - _MARGIN - EDGE + 1, EDGE) for size in wanted.shape)
     corners = [(y, x) for y in down.tolist() for x in across.tolist()]
     counts = np.array([np.count_nonzero(wanted[y : y + EDGE, x : x + EDGE]) for y, x in corners], int)

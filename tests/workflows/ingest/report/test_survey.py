@@ -16,6 +16,7 @@ from workflows.images.integer_formats import decode, encode_png
 from workflows.images.tone_curves import to_light
 from workflows.ingest.report.findings import Finding
 from workflows.ingest.report.report import Report, report
+from workflows.ingest.report.survey import survey
 from workflows.programs.presets import preset
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
@@ -137,6 +138,22 @@ def test_more_noise_and_fewer_patterns_promise_less(ingest: Ingest, capture_arch
     for data in (noisy.getvalue(), few.getvalue()):
         assert all(lesser < b - 2 for lesser, b in zip(promised(data), best, strict=True))
     assert best[0] < best[1] < 60
+
+
+@pytest.mark.slow
+def test_of_a_white_that_was_exposed_unevenly_the_darkest_frame_counts(ingest: Ingest) -> None:
+    scene, program = glass_ball(80, 60, monitor=(320, 240), rays=4), preset("quick", 320, 240)
+    white = program.constants[0][(program.constants[1] == 1).all(axis=1)]
+    exposure = np.where(np.isin(range(program.count), white[:-1]), 1.5, 1.0)
+
+    def see(n: int, picture: NDArray[np.uint8]) -> NDArray[np.floating]:
+        return (0.02 + 0.7 * scene.composite(to_light(picture, "srgb"))) * exposure[n]
+
+    stack = ingest("c", captured(program, see))
+    assert report(stack.attributes, stack.frames).clipping.white > 0.5
+    stack.annotate(auto_exposure=exposure.tolist())
+    survey(stack)
+    assert report(stack.attributes, stack.frames).clipping.white == 0
 
 
 @pytest.mark.slow

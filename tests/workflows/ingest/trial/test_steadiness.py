@@ -197,7 +197,7 @@ def test_rounds_end_when_they_leave_more_than_there_was(grows: float, rounds: in
         return steadiness.Trial(np.roll(off, turns, axis=0) * grows**turns, np.ones_like(off), 1.0)
 
     first = steadiness.Trial(off, np.ones_like(off), 1.0)
-    steadiness._settle(again, first, np.ones(20, bool), True)
+    steadiness._settle(again, np.zeros_like(first.off), first, np.ones(20, bool), True)
     assert turns == rounds
 
 
@@ -212,7 +212,7 @@ def test_where_nothing_settles_the_round_that_explains_most_counts() -> None:
         return steadiness.Trial(turned, np.ones_like(off), left[len(tried) - 1])
 
     first = steadiness.Trial(off, np.ones_like(off), 2.0)
-    state, trial, _ = steadiness._settle(again, first, np.ones(20, bool), True)
+    state, trial, _ = steadiness._settle(again, np.zeros_like(first.off), first, np.ones(20, bool), True)
     assert len(tried) == steadiness.ROUNDS
     assert trial.residual == 1.2
     assert state is tried[2]

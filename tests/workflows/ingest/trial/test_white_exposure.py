@@ -1,0 +1,44 @@
+"""A white frame that was exposed for less time than is known: by how much, the patterns tell."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from storage.layout.captures import Stack
+from tests.parts.captures import captured, nested_program
+from workflows.images.tone_curves import to_light
+from workflows.ingest.trial.white_exposure import find_white_excess
+from workflows.programs.pyramid_light import lay_out
+from workflows.simulation.glass_ball import glass_ball
+
+Ingest = Callable[..., Stack]
+PROGRAM = nested_program((160, 120), bands=((8, 6, 12), (16, 12, 12), (32, 24, 12), (80, 60, 16)), levels=2)
+WHITE = 1
+
+
+def recovered(ingest: Ingest, excess: float, light: float = 0.7) -> float:
+    """The factor that is found; frames are exposed so that patterns have as much light, of full scale, as is given."""
+    scene = glass_ball(80, 60, monitor=(160, 120), rays=4)
+    random = np.random.default_rng(5)
+
+    def see(n: int, picture: NDArray[np.uint8]) -> NDArray[np.floating]:
+        value = 0.02 + light * scene.composite(to_light(picture, "srgb"))
+        return value / (excess if n == WHITE else 1) + 0.004 * random.standard_normal(value.shape)
+
+    stack = ingest("c", captured(PROGRAM, see))
+    return np.exp(find_white_excess(stack, PROGRAM, "srgb", lay_out(PROGRAM, "srgb", ())))
+
+
+@pytest.mark.parametrize("excess", [0.9, 1.15])
+def test_excess_is_found(ingest: Ingest, excess: float) -> None:
+    assert recovered(ingest, excess) == pytest.approx(excess, rel=0.04)
+
+
+def test_excess_is_found_where_patterns_clip_what_they_light(ingest: Ingest) -> None:
+    assert recovered(ingest, 1.4, light=1.2) == pytest.approx(1.4, rel=0.05)
+
+
+def test_without_contrast_there_is_none(ingest: Ingest) -> None:
+    assert recovered(ingest, 1.2, light=0.01) == 1.0

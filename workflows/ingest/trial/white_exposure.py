@@ -1,0 +1,57 @@
+"""Measure by how much the border of a film overestimates the exposure of a white monitor, by trial recoveries."""
+
+import numpy as np
+
+from storage.layout.captures import Stack
+from workflows.images.tone_curves import Curve
+from workflows.ingest.trial.trial_recovery import take_sample, try_recovery
+from workflows.ingest.trial.unexplained import find_unexplained
+from workflows.programs.program import Program
+from workflows.recovery.sensing import Patterns
+
+MOST = 0.4
+"""Largest excess that is searched for,"""
+EXACT = 0.01
+"""and how exactly it is found."""
+
+
+def find_white_excess(stack: Stack, program: Program, monitor: Curve, light: Patterns) -> float:
+    """The logarithm of the gain of all patterns, in units of white, in a film whose exposure was free.
+
+    Parameters
+    ----------
+    stack : Stack
+    program : Program
+    monitor : Curve
+    light : Patterns
+        The program's, without glare.
+
+    Returns
+    -------
+    float
+        From -0.4 to 0.4; 0 if nothing can be tried.
+
+    Notes
+    -----
+    Such a camera exposes white for about two thirds of the time of patterns. Then the lit parts of the border are
+    clipped in nearly all patterns, and exposures are those of its edges: onto these lens, denoising and sharpening
+    spread light of the white monitor beside them, so that white seems to be exposed for longer, by 15 % in the film of
+    a phone. But what pixels show of a pattern that they see as all white is S + rho, and the rows of T add up to 1. So
+    it is the gain with which a trial recovery explains the patterns best. Pixels that see the bare monitor tell it
+    better than those of glass alone, whose rows are free to explain the patterns otherwise: a mask does not count.
+    """
+    from scipy.optimize import minimize_scalar  # takes half a second to import
+
+    measured = dict(stack.attributes)
+    state, shown = np.zeros((stack.frames, 3)), np.isin(stack.attributes["patterns"], program.measured)
+    sample = take_sample(stack, masked=False)
+    found = sample and find_unexplained(stack, program, monitor, light, sample, state)
+
+    def left(gain: float) -> float:
+        state[shown, 2] = gain
+        trial = sample and found and try_recovery(stack, program, monitor, found.patterns, sample, state)
+        return trial.residual if trial else np.inf
+
+    best = minimize_scalar(left, bounds=(-MOST, MOST), method="bounded", options={"xatol": EXACT})
+    stack.annotate(**measured)  # not of this sample
+    return float(best.x) if np.isfinite(best.fun) else 0.0
