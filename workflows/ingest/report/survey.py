@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import light_of_codes
-from workflows.ingest.camera.border_exposure import BorderValues
-from workflows.ingest.camera.calibration import constant_frames, measure
+from workflows.ingest.camera.border_exposure import BorderValues, shortest_white
+from workflows.ingest.camera.calibration import constant_frames, is_free, measure
 from workflows.ingest.camera.lit import find_lit, windows
 from workflows.ingest.local_gain import Places, local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
@@ -52,9 +52,11 @@ def survey(stack: Stack, border: BorderValues | None = None) -> None:
     patterns = np.array(attributes["patterns"])
     frames, sent, times = constant_frames(stack, program)
     level = sent.mean(axis=1) + np.where(times == times.min(), 0, np.nan)
-    # Where the exposure varied, the white frame that clips least.
-    exposed = np.array(attributes["auto_exposure"] or np.ones(stack.frames))[frames]
-    white, black = frames[int(np.lexsort((exposed, -level))[0])], frames[int(np.nanargmin(level))]
+    white, black = frames[int(np.nanargmax(level))], frames[int(np.nanargmin(level))]
+    exposed = attributes["auto_exposure"]
+    if is_free(exposed):
+        shortest = shortest_white(np.array(exposed), attributes["patterns"], program)
+        white = white if shortest is None else shortest
     noise = Noise(**attributes["noise"])
     tones = [] if attributes["scaled"] else _halftone_frames(stack, program)
     special = [black, white, *(frame for frame, _ in tones)]

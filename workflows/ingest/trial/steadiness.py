@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
-from workflows.ingest.camera.border_exposure import BorderLight, BorderValues, shortest_white
+from workflows.ingest.camera.border_exposure import BorderLight, BorderValues
 from workflows.ingest.camera.calibration import is_free, measure
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import black_patterns, look_up_of
@@ -137,9 +137,8 @@ def find_steadiness(
     explained = None if sample is None else _explain(stack, program, sample, border)
     if sample is None or explained is None:
         return None
-    monitor, light, unexplained = explained
+    monitor, light, (at_first, through, _) = explained
     begin = np.zeros((stack.frames, 3))
-    at_first, through, _ = unexplained
     at_rest = measure_rest(stack, program, monitor, through, sample, begin, at_first)
     try_out = partial(try_recovery, stack, program, monitor, through, sample)
     patterns = np.array(stack.attributes["patterns"])
@@ -153,63 +152,70 @@ def find_steadiness(
         first = try_out(begin) or at_rest
         # Most of what is lit is clipped: the gain of a frame is less exact than its exposure by the border.
         first = first._replace(off=first.off * [1, 1, 0])
+    found = _search(try_out, begin, first, at_rest.residual, shown, has_black and not free)
+    corrected = np.concatenate(
+        [found.off[:, :2] * found.moves, (found.off if found.flickers else begin)[:, 2:]], axis=1
+    )
+    gains = np.exp(corrected[:, 2] - (0 if free else np.median(corrected[shown, 2])))
+    figures: dict[str, Any] = {}
+    if found.is_known:
+        code = light.code[light.pyramid.starts[-2] :].reshape(-1, light.channels, program.measured.size)
+        bright = code.mean(axis=(0, 1))[np.searchsorted(program.measured, patterns[shown])]
+        figures = _figures(found, shown, bright)
+        if free:
+            figures["flicker"] = None
+    stack.annotate(
+        steadiness=figures,
+        shifts=corrected[:, :2].round(4).tolist() if found.moves else None,
+        gains=gains.round(5).tolist() if corrected[:, 2].any() else None,
+    )
+    if not corrected.any():
+        return through
+    again = find_unexplained(stack, program, monitor, light, sample, corrected)
+    return again and again.patterns
+
+
+class _Found(NamedTuple):
+    """Shifts and logarithms of gains, (frames, 3), the trial that they are of, and what of them is to be corrected.
+
+    Neither is known if the patterns don't explain what the frames show.
+    """
+
+    off: Doubles
+    trial: Trial
+    moves: bool
+    flickers: bool
+    is_known: bool
+
+
+def _search(
+    try_out: Callable[[Doubles], Trial | None],
+    begin: Doubles,
+    first: Trial,
+    residual: float,
+    shown: NDArray[np.bool_],
+    with_gains: bool,
+) -> _Found:
+    """Find shifts, and gains if these are free, from a beginning, the trial of it, and the residual without either."""
     found, last = begin + _fill_gaps(first, shown), first
     moves = flickers = False
     believed = np.ones(2, bool)
     least = np.array([MIN_DRIFT, MIN_FLICKER])
     size, error = _sizes(found, first, shown)
     if ((size > TRIFLE * least) & (size > LOOK_AGAIN * error)).any():
-        found, last, left = _settle(try_out, begin, first, shown, has_black and not free)
+        found, last, left = _settle(try_out, begin, first, shown, with_gains)
         size, error = _sizes(found, last, shown)
         there = (size >= least) & (size >= SURE * error)
         sure = there & (_sizes(left, last, shown)[0] <= REST * size) & _within(found, shown)
-        believed = _believed(at_rest.residual, last.residual)
+        believed = _believed(residual, last.residual)
         moves = bool(sure[0] and believed[0])
         # Movement that is not a common shift looks like flicker.
-        flickers = bool(sure[1] and believed[1] and has_black and not free and (moves or not there[0]))
+        flickers = bool(sure[1] and believed[1] and with_gains and (moves or not there[0]))
+    if moves or flickers:
+        return _Found(found, last, moves, flickers, is_known=True)
     is_known = last.residual <= EXPLAINED[0] and (last is first or bool(believed.any()))
-    corrected = np.concatenate([found[:, :2] * moves, (found if flickers else begin)[:, 2:]], axis=1)
-    if moves or flickers or is_known:
-        if not moves and not flickers:
-            # The first trial underestimates, but later rounds may have diverged.
-            found, last = begin + _fill_gaps(first, shown), first
-        gain = np.exp(found[:, 2] - np.median(found[shown, 2]))
-        drift = _drift(found[shown, :2], last.error[shown, :2]) | {"corrected": moves}
-        mean = (
-            light.code[light.pyramid.starts[-2] :]
-            .reshape(-1, light.channels, program.measured.size)
-            .mean(axis=(0, 1))
-        )
-        bright = mean[np.searchsorted(program.measured, patterns[shown])]
-        flicker = _flicker(gain, last.error[:, 2], np.flatnonzero(shown), bright) | {"corrected": flickers}
-        # A drift or flicker beyond the limits of the search is something else.
-        within = _within(found, shown)
-        stack.annotate(
-            steadiness={
-                "drift": drift if within[0] else None,
-                "flicker": flicker if within[1] and not free else None,
-            }
-        )
-    else:
-        stack.annotate(steadiness={})
-    if not corrected.any():
-        return through
-    if moves:
-        stack.annotate(shifts=corrected[:, :2].round(4).tolist())
-    if corrected[:, 2].any():
-        gain = np.exp(corrected[:, 2] - np.median(corrected[shown, 2]))
-        stack.annotate(gains=(gain / unit_of(gain, stack.attributes, program)).round(5).tolist())
-    again = find_unexplained(stack, program, monitor, light, sample, corrected)
-    return again and again.patterns
-
-
-def unit_of(gain: Doubles, attributes: dict[str, Any], program: Program) -> float:
-    """The gain that counts as 1: that of the patterns, or of the white frame in whose units a free exposure is."""
-    exposed = attributes["auto_exposure"]
-    if not is_free(exposed):
-        return 1.0
-    white = shortest_white(np.array(exposed), attributes["patterns"], program)
-    return 1.0 if white is None else float(gain[white])
+    # The first trial underestimates, but later rounds may have diverged.
+    return _Found(begin + _fill_gaps(first, shown), first, moves, flickers, is_known)
 
 
 def _believed(before: float, after: float) -> NDArray[np.bool_]:
@@ -262,14 +268,14 @@ def _settle(
     begin: Doubles,
     trial: Trial,
     shown: NDArray[np.bool_],
-    has_black: bool,
+    with_gains: bool,
 ) -> tuple[Doubles, Trial, Doubles]:
     """Correct and measure again, from a beginning and the trial of it, until little is left; returns what was found,
     the trial of it, and what that left.
 
     Where more is left whatever is done, later rounds wander: then it is the round that explains the frames best.
     """
-    scale, free = np.array([1, 1, SETTLED[0] / SETTLED[1]]), np.array([1, 1, int(has_black)])
+    scale, free = np.array([1, 1, SETTLED[0] / SETTLED[1]]), np.array([1, 1, int(with_gains)])
     state = begin
     states: list[Doubles] = []
     steps: list[Doubles] = []
@@ -341,6 +347,16 @@ def _within(found: Doubles, shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Whether shifts and gains are within `LIMITS`."""
     most = np.abs(found[shown]).max(axis=0) < LIMITS
     return np.array([most[:2].all(), most[2]])
+
+
+def _figures(found: _Found, shown: NDArray[np.bool_], bright: Doubles) -> dict[str, Any]:
+    """The figures of drift and flicker; of what is beyond the limits of the search, and so something else, None."""
+    off, error = found.off, found.trial.error
+    gain = np.exp(off[:, 2] - np.median(off[shown, 2]))
+    drift = _drift(off[shown, :2], error[shown, :2]) | {"corrected": found.moves}
+    flicker = _flicker(gain, error[:, 2], np.flatnonzero(shown), bright) | {"corrected": found.flickers}
+    within = _within(off, shown)
+    return {"drift": drift if within[0] else None, "flicker": flicker if within[1] else None}
 
 
 def _drift(places: Doubles, error: Doubles) -> dict[str, Any]:

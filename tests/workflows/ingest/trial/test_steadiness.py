@@ -24,7 +24,6 @@ from workflows.images.tone_curves import to_light
 from workflows.ingest.report.findings import Finding
 from workflows.ingest.report.report import report
 from workflows.ingest.trial import steadiness
-from workflows.ingest.trial.steadiness import unit_of
 from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
 from workflows.programs.presets import preset
@@ -238,18 +237,6 @@ def test_too_small_a_frame_tells_nothing(ingest: Ingest) -> None:
     stack = ingest("c", target.getvalue())
     assert stack.attributes["steadiness"] is None
     assert stack.attributes["shifts"] is stack.attributes["gains"] is None
-
-
-@pytest.mark.parametrize(("shortest", "unit"), [(1.0, 0.85), (1.9, 1.0)])
-def test_gains_are_in_units_of_the_white_that_a_free_exposure_is(shortest: float, unit: float) -> None:
-    shown = preset("sketch", 320, 240)
-    numbers, sent = shown.constants
-    white = numbers[(sent == 1).all(axis=1)]
-    exposures, gains = np.full(shown.count, 2.0), np.ones(shown.count)
-    exposures[white[1]], gains[white] = shortest, (0.6, 0.85, 0.6)
-    attributes = {"auto_exposure": exposures.tolist(), "patterns": list(range(shown.count))}
-    assert unit_of(gains, attributes, shown) == unit
-    assert unit_of(gains, attributes | {"auto_exposure": None}, shown) == 1
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
+from workflows.ingest.trial.steadiness import find_steadiness
+from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.ingest.trial.white_exposure import find_white_excess
 from workflows.programs.pyramid_light import lay_out
 from workflows.simulation.glass_ball import glass_ball
@@ -18,8 +20,8 @@ PROGRAM = nested_program((160, 120), bands=((8, 6, 12), (16, 12, 12), (32, 24, 1
 WHITE = 1
 
 
-def recovered(ingest: Ingest, excess: float, light: float = 0.7) -> float:
-    """The factor that is found; frames are exposed so that patterns have as much light, of full scale, as is given."""
+def stack_of(ingest: Ingest, excess: float, light: float = 0.7) -> Stack:
+    """Patterns have so much light, of full scale, and white as much by so many times the exposure that it had."""
     scene = glass_ball(80, 60, monitor=(160, 120), rays=4)
     random = np.random.default_rng(5)
 
@@ -27,18 +29,34 @@ def recovered(ingest: Ingest, excess: float, light: float = 0.7) -> float:
         value = 0.02 + light * scene.composite(to_light(picture, "srgb"))
         return value / (excess if n == WHITE else 1) + 0.004 * random.standard_normal(value.shape)
 
-    stack = ingest("c", captured(PROGRAM, see))
-    return np.exp(find_white_excess(stack, PROGRAM, "srgb", lay_out(PROGRAM, "srgb", ())))
+    return ingest("c", captured(PROGRAM, see))
+
+
+def found(stack: Stack) -> float:
+    return float(np.exp(find_white_excess(stack, PROGRAM, "srgb", lay_out(PROGRAM, "srgb", ()))))
 
 
 @pytest.mark.parametrize("excess", [0.9, 1.15])
 def test_excess_is_found(ingest: Ingest, excess: float) -> None:
-    assert recovered(ingest, excess) == pytest.approx(excess, rel=0.04)
+    assert found(stack_of(ingest, excess)) == pytest.approx(excess, rel=0.04)
 
 
 def test_excess_is_found_where_patterns_clip_what_they_light(ingest: Ingest) -> None:
-    assert recovered(ingest, 1.4, light=1.2) == pytest.approx(1.4, rel=0.05)
+    assert found(stack_of(ingest, 1.4, light=1.2)) == pytest.approx(1.4, rel=0.05)
 
 
 def test_without_contrast_there_is_none(ingest: Ingest) -> None:
-    assert recovered(ingest, 1.2, light=0.01) == 1.0
+    assert found(stack_of(ingest, 1.2, light=0.01)) == 1.0
+
+
+def test_it_evens_out_the_patterns_of_a_film_whose_exposure_was_free(ingest: Ingest) -> None:
+    stack = stack_of(ingest, 1.5)
+    exposures = np.where(np.arange(stack.frames) == WHITE, 1, 1.4)
+    stack.annotate(auto_exposure=exposures.tolist())
+    find_steadiness(stack, take_sample(stack))
+    shown = np.isin(stack.attributes["patterns"], PROGRAM.measured)
+    gains = np.array(stack.attributes["gains"])
+    np.testing.assert_allclose(gains[shown], 1.5 / 1.4, rtol=0.03)
+    assert (gains[~shown] == 1).all()
+    assert stack.attributes["steadiness"]["flicker"] is None
+    assert stack.attributes["shifts"] is None
