@@ -126,7 +126,7 @@ def match_frames(
     if wrong or (unlike and not (numbered and resemblance.compared(program, looks) < MANY)):
         raise refusal(
             "what changes in the video does not look like the patterns of the program: check that capture.json has the "
-            "program that was shown, and its patterns_per_second"
+            "program that was shown and its patterns_per_second, and film from a tripod"
         )
     shown = max(looks, default=-1) + 1 if unfinished else program.count
     _require_enough(program, shown, looks, reasons, rate, refusal)
