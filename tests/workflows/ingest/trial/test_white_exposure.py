@@ -21,7 +21,7 @@ WHITE = 1
 
 
 def stack_of(ingest: Ingest, excess: float, light: float = 0.7) -> Stack:
-    """Patterns have so much light, of full scale, and white as much by so many times the exposure that it had."""
+    """White was exposed for so much less time than is known; patterns have so much light, as a share of full scale."""
     scene = glass_ball(80, 60, monitor=(160, 120), rays=4)
     random = np.random.default_rng(5)
 
