@@ -16,7 +16,9 @@ EXACT = 0.01
 
 
 def find_white_excess(stack: Stack, program: Program, monitor: Curve, light: Patterns) -> float:
-    """The logarithm of the gain of all patterns, in units of white, in a film whose exposure was free.
+    """The logarithm of the factor by which the border overestimates the exposure of white, if that was free.
+
+    It is the gain of all patterns, in units of white's.
 
     Parameters
     ----------
@@ -29,7 +31,7 @@ def find_white_excess(stack: Stack, program: Program, monitor: Curve, light: Pat
     Returns
     -------
     float
-        From -0.4 to 0.4; 0 if nothing can be tried.
+        From -0.4 to 0.4; 0 if nothing can be tried. The stack's attributes are as they were.
 
     Notes
     -----
@@ -53,5 +55,5 @@ def find_white_excess(stack: Stack, program: Program, monitor: Curve, light: Pat
         return trial.residual if trial else np.inf
 
     best = minimize_scalar(left, bounds=(-MOST, MOST), method="bounded", options={"xatol": EXACT})
-    stack.annotate(**measured)  # not of this sample
+    stack.annotate(**measured)
     return float(best.x) if np.isfinite(best.fun) else 0.0
