@@ -37,11 +37,11 @@ def survey(stack: Stack, border: BorderValues | None = None) -> None:
     ----------
     stack : Stack
         With its attributes after `find_steadiness`. If its frames flicker, the noise is measured again, because flicker
-        is not noise.
+        is not noise. The constant frames of a free exposure have no gain.
     border : BorderValues, optional
         Of a film with a border.
     """
-    if stack.attributes["gains"] is not None:
+    if stack.attributes["gains"] is not None and not is_free(stack.attributes["auto_exposure"]):
         noise = stack.attributes["noise"]
         measure(stack, border, stack.attributes["gains"], stack.attributes["tone_mapping"])
         if stack.attributes["noise_of_patterns"]:

@@ -23,6 +23,8 @@ from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 
+MEASURED = ("noise", "noise_of_patterns", "model_error", "smooth_error", "pattern_error", "glare")
+"""The attributes of a stack that `find_unexplained` writes."""
 ROUNDS = 5
 """Recoveries of the sample, at most: each sees the patterns through the glare that the one before has found."""
 SETTLED, NOISE_SETTLED = 0.003, 0.2

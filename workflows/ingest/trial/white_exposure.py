@@ -1,11 +1,13 @@
 """Measure by how much the border of a film overestimates the exposure of a white monitor, by trial recoveries."""
 
+from functools import partial
+
 import numpy as np
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
 from workflows.ingest.trial.trial_recovery import take_sample, try_recovery
-from workflows.ingest.trial.unexplained import find_unexplained
+from workflows.ingest.trial.unexplained import MEASURED, find_unexplained
 from workflows.programs.program import Program
 from workflows.recovery.sensing import Patterns
 
@@ -44,16 +46,19 @@ def find_white_excess(stack: Stack, program: Program, monitor: Curve, light: Pat
     """
     from scipy.optimize import minimize_scalar  # takes half a second to import
 
-    measured = dict(stack.attributes)
+    measured = {name: stack.attributes[name] for name in MEASURED}
     state, shown = np.zeros((stack.frames, 3)), np.isin(stack.attributes["patterns"], program.measured)
-    sample = take_sample(stack, masked=False)
-    found = sample and find_unexplained(stack, program, monitor, light, sample, state)
+    excess, sample = 0.0, take_sample(stack, masked=False)
+    found = None if sample is None else find_unexplained(stack, program, monitor, light, sample, state)
+    if sample is not None and found is not None:
+        try_out = partial(try_recovery, stack, program, monitor, found.patterns, sample)
 
-    def left(gain: float) -> float:
-        state[shown, 2] = gain
-        trial = sample and found and try_recovery(stack, program, monitor, found.patterns, sample, state)
-        return trial.residual if trial else np.inf
+        def left(gain: float) -> float:
+            state[shown, 2] = gain
+            trial = try_out(state)
+            return np.inf if trial is None else trial.residual
 
-    best = minimize_scalar(left, bounds=(-MOST, MOST), method="bounded", options={"xatol": EXACT})
+        best = minimize_scalar(left, bounds=(-MOST, MOST), method="bounded", options={"xatol": EXACT})
+        excess = float(best.x) if np.isfinite(best.fun) else 0.0
     stack.annotate(**measured)
-    return float(best.x) if np.isfinite(best.fun) else 0.0
+    return excess

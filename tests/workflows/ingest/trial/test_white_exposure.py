@@ -38,7 +38,10 @@ def found(stack: Stack) -> float:
 
 @pytest.mark.parametrize("excess", [0.9, 1.15])
 def test_excess_is_found(ingest: Ingest, excess: float) -> None:
-    assert found(stack_of(ingest, excess)) == pytest.approx(excess, rel=0.04)
+    stack = stack_of(ingest, excess)
+    measured = dict(stack.attributes)
+    assert found(stack) == pytest.approx(excess, rel=0.04)
+    assert stack.attributes == measured
 
 
 def test_excess_is_found_where_patterns_clip_what_they_light(ingest: Ingest) -> None:
