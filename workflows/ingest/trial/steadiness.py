@@ -47,8 +47,8 @@ REST = 0.25
 """The last round may leave at most this share of what was found."""
 EXPLAINED = np.array([2.4, 1.5])
 """Largest residuals with which shifts and gains are believed, in standard deviations of the noise."""
-DIVERGED = 3
-"""Rounds end, too, when so many in succession each left more than there was at first: they will not settle."""
+STALLED = 0.005
+"""Rounds end, too, when two in succession lower the squared residual by less than this share: they wander."""
 LEFT = 0.4
 """The squared residual may keep this share of its excess over noise. If it keeps more, the frames differ from what is
 predicted in ways that only look like shifts and gains."""
@@ -280,7 +280,7 @@ def _settle(
     states: list[Doubles] = []
     steps: list[Doubles] = []
     tried: list[tuple[Doubles, Trial]] = []
-    diverged = 0
+    least = [trial.residual**2]
     for _ in range(ROUNDS):
         step = _fill_gaps(trial, shown) * free
         states.append(state * scale)
@@ -301,11 +301,11 @@ def _settle(
             break
         state, trial = ahead, again
         left = _fill_gaps(trial, shown)
-        if _size(left[shown, :2]) < SETTLED[0] and _size(left[shown, 2:]) < SETTLED[1]:
+        if _size(left[shown, :2]) < SETTLED[0] and _size((left * free)[shown, 2:]) < SETTLED[1]:
             return state, trial, left
         tried.append((state, trial))
-        diverged = diverged + 1 if _size((left * free * scale)[shown]) > _size(steps[0][shown]) else 0
-        if diverged == DIVERGED:
+        least.append(min(least[-1], trial.residual**2))
+        if len(tried) > 1 and least[-1] > (1 - STALLED) * least[-3]:
             break
     state, trial = min(tried, key=lambda one: one[1].residual, default=(state, trial))
     return state, trial, _fill_gaps(trial, shown)

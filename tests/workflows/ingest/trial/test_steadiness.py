@@ -185,36 +185,48 @@ def test_flicker_is_found_and_taken_out(
     assert with_it > without + gain
 
 
-@pytest.mark.parametrize(("grows", "rounds"), [(1.3, 3), (0.9, steadiness.ROUNDS), (0.01, 2)])
-def test_rounds_end_when_they_leave_more_than_there_was(grows: float, rounds: int) -> None:
-    off, turns = np.random.default_rng(0).normal(0, 0.1, (20, 3)), 0
-
-    def again(_: NDArray[np.float64]) -> steadiness.Trial:
-        nonlocal turns
-        turns += 1
-        # turned, so that what is left is no multiple of what was found
-        return steadiness.Trial(np.roll(off, turns, axis=0) * grows**turns, np.ones_like(off), 1.0)
-
-    first = steadiness.Trial(off, np.ones_like(off), 1.0)
-    steadiness._settle(again, np.zeros_like(first.off), first, np.ones(20, bool), True)
-    assert turns == rounds
+OFF = np.random.default_rng(0).normal(0, 0.1, (20, 3))
+ALL = np.ones(20, bool)
 
 
-def test_where_nothing_settles_the_round_that_explains_most_counts() -> None:
-    off = np.random.default_rng(0).normal(0, 0.1, (20, 3))
-    left = [1.6, 1.3, 1.2, *[1.4] * (steadiness.ROUNDS - 3)]
+@pytest.mark.parametrize(("with_gains", "rounds"), [(True, 2), (False, 1)])
+def test_rounds_end_when_what_is_searched_for_has_settled(with_gains: bool, rounds: int) -> None:
     tried: list[NDArray[np.float64]] = []
 
     def again(state: NDArray[np.float64]) -> steadiness.Trial:
         tried.append(state)
-        turned = np.roll(off, len(tried), axis=0) * 0.9
-        return steadiness.Trial(turned, np.ones_like(off), left[len(tried) - 1])
+        gain = 0.1 if len(tried) == 1 else 0
+        return steadiness.Trial(OFF * [0.001, 0.001, gain], np.ones_like(OFF), 1.0)
 
-    first = steadiness.Trial(off, np.ones_like(off), 2.0)
-    state, trial, _ = steadiness._settle(again, np.zeros_like(first.off), first, np.ones(20, bool), True)
-    assert len(tried) == steadiness.ROUNDS
-    assert trial.residual == 1.2
-    assert state is tried[2]
+    first = steadiness.Trial(OFF, np.ones_like(OFF), 2.0)
+    steadiness._settle(again, np.zeros_like(OFF), first, ALL, with_gains)
+    assert len(tried) == rounds
+
+
+@pytest.mark.parametrize(
+    ("left", "best"),
+    [
+        ([2.1, 2.0], 1),
+        ([1.6, 1.3, 1.2, 1.3, 1.25], 2),
+        ([1.9, 2.1, 1.8, 1.797, 1.796], 4),
+        ((2 * 0.99 ** np.arange(1, steadiness.ROUNDS + 1)).tolist(), steadiness.ROUNDS - 1),
+    ],
+)
+def test_where_nothing_settles_rounds_end_when_they_explain_no_more_and_the_best_counts(
+    left: list[float], best: int
+) -> None:
+    tried: list[NDArray[np.float64]] = []
+
+    def again(state: NDArray[np.float64]) -> steadiness.Trial:
+        tried.append(state)
+        # turned, so that what is left is no multiple of what was found
+        return steadiness.Trial(np.roll(OFF, len(tried), axis=0), np.ones_like(OFF), left[len(tried) - 1])
+
+    first = steadiness.Trial(OFF, np.ones_like(OFF), 2.0)
+    state, trial, _ = steadiness._settle(again, np.zeros_like(OFF), first, ALL, True)
+    assert len(tried) == len(left)
+    assert trial.residual == left[best]
+    assert state is tried[best]
 
 
 @pytest.mark.slow
