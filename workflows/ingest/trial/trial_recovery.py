@@ -28,9 +28,10 @@ from workflows.programs.program import Program
 from workflows.recovery.camera.noise import Noise
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.options import FINE, LobesOptions
-from workflows.recovery.lobes.recover import recover
+from workflows.recovery.lobes.recover import Recovery, recover
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
+from workflows.threads import CORES, in_parts
 
 EDGE = 8
 """Side in pixels of the squares that are examined."""
@@ -42,6 +43,8 @@ MIN_SQUARES = 8
 """Squares that are needed: the spread of their results gives the standard error."""
 PIXELS = 640
 """Pixels of the squares that are recovered, at most."""
+ALONE = 80
+"""Pixels that a thread recovers at a time, where none starts from its neighbours."""
 VALUES = 1 << 20
 """Pixels times frames that are recovered, at most."""
 MIN_PIXELS = 100
@@ -247,19 +250,33 @@ def recover_seen(
         return None
     conditions = conditions_of(stack, program)
     used[:, held_out] = False
-    transport, photometry, _, stray = recover(
-        measurements,
-        photometry,
-        patterns,
-        noise,
-        used,
-        worth,
-        options,
-        conditions,
-        places,
-    )
+    n = len(measurements)
+    firsts = range(0, n, n if places is not None else ALONE)
+    parts: dict[int, Recovery] = {}
+
+    def recover_part(first: int) -> None:
+        at = slice(first, first + firsts.step)
+        of_part = Photometry(*(values[at] for values in vars(photometry).values()))
+        parts[first] = recover(
+            measurements[at], of_part, patterns, noise, used[at], worth[at], options, conditions, places
+        )
+
+    in_parts(recover_part, firsts, CORES)
+    made = _joined([parts[first] for first in firsts])
     assert conditions.strays is not None
-    return RecoveredSample(found, photometry, transport, conditions.strays, stray, alive, seen)
+    return RecoveredSample(found, made.photometry, made.transport, conditions.strays, made.stray, alive, seen)
+
+
+def _joined(parts: list[Recovery]) -> Recovery:
+    """The recovery of the pixels of all parts, in order."""
+    transports, photometries, errors, strays = zip(*parts, strict=True)
+    fields = zip(*(vars(photometry).values() for photometry in photometries), strict=True)
+    return Recovery(
+        Transport.concatenate(transports),
+        Photometry(*map(np.concatenate, fields)),
+        np.concatenate(errors),
+        None if strays[0] is None else np.concatenate(strays),
+    )
 
 
 def try_recovery(

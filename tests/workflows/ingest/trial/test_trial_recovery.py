@@ -1,0 +1,41 @@
+"""A sample of a capture is recovered in parts, on several threads."""
+
+import io
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from storage.layout.captures import Stack
+from tests.parts.captures import nested_program
+from workflows.ingest.trial import trial_recovery
+from workflows.ingest.trial.trial_recovery import ALONE, recover_sample, take_sample
+from workflows.programs.pyramid_light import lay_out
+from workflows.simulation.glass_ball import glass_ball
+from workflows.simulation.scene import write_capture
+
+
+def test_a_sample_is_the_same_in_any_parts_and_on_any_threads(
+    ingest: Callable[..., Stack], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, target = nested_program((160, 120), bands=((8, 6, 12), (16, 12, 12), (32, 24, 12))), io.BytesIO()
+    write_capture(glass_ball(80, 60, monitor=(160, 120), rays=4), program, target, noise=0.5)
+    stack = ingest("c", target.getvalue())
+    sample = take_sample(stack)
+    assert sample
+    n = len(sample.chosen[0])
+    assert n > 2 * ALONE
+    patterns, at_rest = lay_out(program, "srgb"), np.zeros((stack.frames, 3))
+
+    def recovered(alone: int, cores: int) -> list[bytes]:
+        monkeypatch.setattr(trial_recovery, "ALONE", alone)
+        monkeypatch.setattr(trial_recovery, "CORES", cores)
+        found = recover_sample(stack, program, "srgb", patterns, sample, at_rest)
+        assert found
+        assert len(found.photometry.S) == len(found.transport.count) == n
+        fields = (*vars(found.transport).values(), *vars(found.photometry).values())
+        return [np.asarray(value).tobytes() for value in fields]
+
+    whole = recovered(n, 1)
+    assert recovered(ALONE, 1) == whole
+    assert recovered(ALONE, 3) == whole
