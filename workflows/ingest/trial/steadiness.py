@@ -281,10 +281,10 @@ def _settle(
     steps: list[Doubles] = []
     tried: list[tuple[Doubles, Trial]] = []
     least = [trial.residual**2]
+    left = _fill_gaps(trial, shown) * free
     for _ in range(ROUNDS):
-        step = _fill_gaps(trial, shown) * free
         states.append(state * scale)
-        steps.append(step * scale)
+        steps.append(left * scale)
         ahead = states[-1] + steps[-1]
         if len(steps) > 1:
             from_steps, from_states = (
@@ -300,15 +300,15 @@ def _settle(
         if again is None:
             break
         state, trial = ahead, again
-        left = _fill_gaps(trial, shown)
-        if _size(left[shown, :2]) < SETTLED[0] and _size((left * free)[shown, 2:]) < SETTLED[1]:
+        left = _fill_gaps(trial, shown) * free
+        if _size(left[shown, :2]) < SETTLED[0] and _size(left[shown, 2:]) < SETTLED[1]:
             return state, trial, left
         tried.append((state, trial))
         least.append(min(least[-1], trial.residual**2))
         if len(tried) > 1 and least[-1] > (1 - STALLED) * least[-3]:
             break
     state, trial = min(tried, key=lambda one: one[1].residual, default=(state, trial))
-    return state, trial, _fill_gaps(trial, shown)
+    return state, trial, _fill_gaps(trial, shown) * free
 
 
 def _fill_gaps(trial: Trial, shown: NDArray[np.bool_]) -> Doubles:
