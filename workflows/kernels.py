@@ -150,7 +150,7 @@ def use_matte(objects: Objects) -> None:
     encode_live(matte, threads=1)
     shares = [0.01] * (len(WIDTHS) + 1)  # few captures have any glare
     add_glare(rows_of(matte, matte.read(0, 0)), shares)
-    patterns = lay_out(preset("sketch", *MONITOR), "linear")
+    patterns = lay_out(preset("sketch", *MONITOR), "linear", scaled=True)
     filter_patterns(patterns, spread_patterns(patterns), shares)
     off_sight(matte.read(0, 0), matte, np.zeros((HEIGHT, WIDTH, 2)), pitch=0.01, aspect=0.75)
     places = places_of(matte, threads=1)

@@ -223,8 +223,9 @@ def sensing_of(objects: Objects, capture: str) -> Sensing:
 def patterns_of(objects: Objects, capture: str) -> Patterns:
     """A capture's patterns on a pyramid, as they arrive through its glare."""
     program, monitor = program_of(objects, capture)
-    patterns = lay_out(program, monitor, _images_of(objects, capture))
-    glare = Stack(objects, capture).attributes.get("glare")
+    attributes = Stack(objects, capture).attributes
+    scaled, glare = (attributes.get(name) for name in ("scaled", "glare"))
+    patterns = lay_out(program, monitor, _images_of(objects, capture), scaled=bool(scaled))
     return filter_patterns(patterns, spread_patterns(patterns), glare) if glare else patterns
 
 

@@ -7,14 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.images.integer_formats import Codes, to_integers
+from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
-from workflows.programs.program import Constant, Halftone, Program
+from workflows.programs.interpolation import interpolated_light
+from workflows.programs.program import Constant, Halftone, Images, Program
 from workflows.recovery.pyramid import Pyramid, halve_codes
 from workflows.recovery.sensing import Patterns
 
 CODE = np.dtype(np.uint8)
 PATTERNS_BYTES = 256 << 20
 """Bytes that a worker may hold of a program. Beyond that, the pyramid starts at cells of several pixels."""
+MOST_SCALED = 1 << 23
+"""Pixels of a monitor up to which the light of scaled patterns is worked out, one pattern in full at a time. On larger
+monitors blocks have more pixels, and their edges lose little light."""
 
 # Patterns written at a time, because the patterns of a node are neighbours in memory.
 _BATCH = 24
@@ -31,7 +36,9 @@ def pyramid_of(program: Program, channels: int) -> Pyramid:
     return pyramid
 
 
-def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]] = ()) -> Patterns:
+def lay_out(
+    program: Program, curve: Curve, images: Sequence[NDArray[np.float32]] = (), *, scaled: bool = False
+) -> Patterns:
     """Lay the patterns of a program, without the constant ones, out on its pyramid.
 
     Parameters
@@ -41,6 +48,9 @@ def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]
         From value sent to the monitor to light emitted.
     images : sequence of (rows, columns, 1 or 3) float32
         The images of the `Images` parts, in order.
+    scaled : bool
+        Whether the monitor shows the patterns at another size, see `interpolated_light`. Images are taken as they are,
+        and so are all patterns of a monitor of more than `MOST_SCALED` pixels.
 
     Returns
     -------
@@ -51,7 +61,7 @@ def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]
     columns, rows = pyramid.grids[0]
     m = program.measured.size
     code = np.empty((pyramid.nodes, channels * m), np.uint8)
-    measured = _codes(program, curve, images, columns, rows)
+    measured = _codes(program, curve, images, columns, rows, scaled=scaled)
     planes = np.empty((channels, min(_BATCH, m), rows, columns), np.uint8)
     for first in range(0, m, _BATCH):
         batch = planes[:, : m - first]
@@ -68,18 +78,30 @@ def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]
 
 
 def _codes(
-    program: Program, curve: Curve, images: Sequence[NDArray[np.float32]], columns: int, rows: int
+    program: Program,
+    curve: Curve,
+    images: Sequence[NDArray[np.float32]],
+    columns: int,
+    rows: int,
+    *,
+    scaled: bool,
 ) -> Iterator[Codes]:
     """The light of the pictures that tell T on a grid, (rows, columns, 1 or 3) uint8 each."""
-    at_pixels = (columns, rows) == (program.monitor.width, program.monitor.height)
+    pixels = program.monitor.width * program.monitor.height
     for start, part in zip(program.starts, program.parts, strict=False):
         if isinstance(part, Constant | Halftone):
             continue
         numbers = start, start + part.count
-        if at_pixels:
+        # The light of a cell is the mean of its pixels: the curve is applied before, rounding after.
+        if scaled and pixels <= MOST_SCALED and not isinstance(part, Images):
+            for picture in program.mapped(lambda values: values > 0, *numbers, images):
+                lights = (interpolated_light(plane, curve) for plane in np.moveaxis(picture, 2, 0))
+                cells = [area_mean(light[..., np.newaxis], columns, rows) for light in lights]
+                yield to_integers(np.concatenate(cells, axis=2), CODE)
+        elif pixels == columns * rows:
             yield from program.mapped(
                 lambda values: to_integers(to_light(values, curve), CODE), *numbers, images
             )
-        else:  # the light of a cell is the mean of its pixels: the curve is applied before, rounding after
-            lights = program.means(lambda values: to_light(values, curve), columns, rows, *numbers, images)
-            yield from (to_integers(light, CODE) for light in lights)
+        else:
+            means = program.means(lambda values: to_light(values, curve), columns, rows, *numbers, images)
+            yield from (to_integers(light, CODE) for light in means)

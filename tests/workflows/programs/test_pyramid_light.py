@@ -1,6 +1,7 @@
 """The patterns of a program on a pyramid: the pictures at its first grid, channel after channel, whatever the room."""
 
 import tracemalloc
+from itertools import product
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, Gamma, to_light
 from workflows.programs import pyramid_light
+from workflows.programs.interpolation import interpolated_light
 from workflows.programs.program import Bernoulli, Constant, Halftone, Images, Monitor, Program, Stripes
 from workflows.programs.pyramid_light import lay_out, pyramid_of
 from workflows.recovery.sensing import Patterns
@@ -117,14 +119,30 @@ def test_with_little_room_cells_are_means_of_pixels(
     check(laid_out, light_of(program, "srgb", images))
 
 
-def test_a_large_monitor_takes_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("room", "grid"), [(18 * 1500, (40, 30)), (18 * 1500 - 1, (20, 15))])
+def test_scaled_patterns_have_the_light_of_interpolated_pictures_but_images_do_not(
+    monkeypatch: pytest.MonkeyPatch, room: int, grid: tuple[int, int]
+) -> None:
+    image = [np.random.default_rng(0).random((30, 40, 1), np.float32)] * 2
+    program = program_of(RGB, CONSTANT, PHOTOGRAPHS)
+    monkeypatch.setattr(pyramid_light, "PATTERNS_BYTES", room)
+    light = light_of(program, "srgb", image).reshape(HEIGHT, WIDTH, 3, -1)
+    for at in product(range(3), range(RGB.count)):
+        light[:, :, *at] = interpolated_light(light[:, :, *at] > 0, "srgb")
+    laid_out = lay_out(program, "srgb", image, scaled=True)
+    assert laid_out.pyramid.grids[0] == grid
+    check(laid_out, light.reshape(HEIGHT, WIDTH, -1))
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_a_large_monitor_takes_little_memory(monkeypatch: pytest.MonkeyPatch, scaled: bool) -> None:
     """Its pixels would take 1 GB for each channel, those of constant patterns and half-tones too."""
     monitor = Monitor(width=16384, height=16384)
     parts = (CONSTANT, Halftone(kind="halftone", levels=(0.25,)), MANY)
     monkeypatch.setattr(pyramid_light, "PATTERNS_BYTES", 1 << 23)
     tracemalloc.start()
     try:
-        lay_out(Program(monitor=monitor, parts=parts), "srgb")
+        lay_out(Program(monitor=monitor, parts=parts), "srgb", scaled=scaled)
         assert tracemalloc.get_traced_memory()[1] < 100_000_000
     finally:
         tracemalloc.stop()

@@ -315,7 +315,7 @@ def _scaling(program: Program, *, scaled: bool) -> list[Finding]:
             name="scaling",
             level="warning",
             message="the monitor showed the patterns at another size than they were made for, as their half-tones "
-            "tell: light is located less sharply",
+            "tell: recovery corrects it",
             remedy="set the browser's zoom to 100 % (Ctrl+0 or ⌘0), or play the film at its own size, and make the "
             "program for the monitor's size",
         )

@@ -239,7 +239,7 @@ def _explain(
     at_rest, turn = np.zeros((stack.frames, 3)), 0
     while True:
         monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
-        light = lay_out(program, monitor, stack.images())
+        light = lay_out(program, monitor, stack.images(), scaled=stack.attributes["scaled"])
         found = find_unexplained(stack, program, monitor, light, sample, at_rest)
         if found is None:
             return None

@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import zoom
 
 from storage.layout import mattes
 from storage.layout.captures import Stack
@@ -26,6 +27,7 @@ from workflows.ingest.report.report import report
 from workflows.ingest.trial import steadiness
 from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
+from workflows.mattes.tiles import patterns_of
 from workflows.programs.presets import preset
 from workflows.programs.program import Program
 from workflows.simulation.glass_ball import glass_ball
@@ -185,6 +187,28 @@ def test_flicker_is_found_and_taken_out(
     assert with_it > without + gain
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("ball", ["quick"], indirect=True)
+def test_scaled_patterns_do_not_flicker_and_are_recovered_as_the_monitor_interpolates_them(
+    ingest: Ingest, objects: Objects, ball: Ball
+) -> None:
+    scene, program, _, mask = ball
+    enlarged = (
+        zoom(picture, (1.25, 1.25, 1), order=1, mode="nearest", grid_mode=True)
+        for picture in program.pictures(0, program.count)
+    )
+    light = [scene.composite(to_light(picture, "srgb")) for picture in enlarged]
+    stack = ingest("c", filmed((scene, program, light, mask), *steady(ball)))
+    assert stack.attributes["scaled"]
+    assert stack.attributes["gains"] is None
+    as_shown = decibels(objects, ball, (0, 0))
+    stack.annotate(scaled=False)
+    stack.save()
+    patterns_of.cache_clear()
+    as_made = decibels(objects, ball, (0, 0))
+    assert as_shown > as_made + 4
+
+
 OFF = np.random.default_rng(0).normal(0, 0.1, (20, 3))
 ALL = np.ones(20, bool)
 
@@ -268,6 +292,7 @@ def test_border_tells_tone_mapping_if_the_exposure_was_locked(
         "tone_mapping": None,
         "monitor_curve": "srgb",
         "camera_curve": "srgb",
+        "scaled": False,
         "storage": {"black": 0},
     }
     stack = SimpleNamespace(attributes=attributes, dtype=np.dtype(np.uint8), frames=2, images=list)

@@ -239,7 +239,7 @@ export const de = {
 	"the frames differ from what the patterns explain in ways that are neither a movement of the camera nor a flicker of the light, so these can't be measured": "die Bilder weichen von den Mustern ab, aber weder durch eine Bewegung der Kamera noch durch flackerndes Licht, darum lässt sich beides nicht messen",
 	"the ingest was cancelled; upload the capture again": "das Einlesen wurde abgebrochen; die Aufnahme neu hochladen",
 	"the light varies by {percent} % between frames, by {worst} % in frame {frame}": "das Licht schwankt von Bild zu Bild um {percent} %, in Bild {frame} um {worst} %",
-	"the monitor showed the patterns at another size than they were made for, as their half-tones tell: light is located less sharply": "der Monitor hat die Muster in anderer Größe gezeigt, als sie gemacht sind, wie ihre Halbtöne verraten: Licht wird weniger genau geortet",
+	"the monitor showed the patterns at another size than they were made for, as their half-tones tell": "der Monitor hat die Muster in anderer Größe gezeigt, als sie gemacht sind, wie ihre Halbtöne verraten",
 	"the monitor showed the patterns pixel by pixel": "der Monitor hat die Muster Pixel für Pixel gezeigt",
 	"the monitor's curve is {curve}, {how}": "die Kennlinie des Monitors ist {curve}, {how}",
 	"the monitor's curve, which the capture states": "die Kennlinie des Monitors, die die Aufnahme nennt",
