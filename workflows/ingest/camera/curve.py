@@ -34,6 +34,8 @@ EXPOSED = 2.0
 """Weight of relative errors of the half-tones' exposures, beside the relative errors of groups of values."""
 SMOOTH = 0.02
 """Weight of the curvature of the slopes; it decides where no value is."""
+USUAL = 0.05
+"""Weight of the slopes' difference from those of sRGB, beyond the brightest value."""
 DARK = 0.02
 """Light below which relative errors count no more."""
 
@@ -96,9 +98,10 @@ def fit_camera_curve(seen: HalfTones, channels: int = 1) -> Fitted:
     Since pixels differ in brightness, t = 1/2 alone determines F from white down to the darkest. F is that of sRGB with
     its slope multiplied by a piecewise linear function, w >= 0 at the knots, so that F is monotone and the equations
     are linear in w; ``F(1) = 1`` sets the scale. They are solved by non-negative least squares, with a small penalty on
-    the second differences of w. The exposure of each half-tone may be off by some per cent: those of a film are only
-    estimated, and light flickers. Each equation is a mean over values of about the same white, because noise and dots
-    that the camera partly resolves would otherwise pull towards a curve that hides them.
+    the second differences of w, and, beyond the brightest value, on w - 1: nothing else sets the scale of dark frames.
+    The exposure of each half-tone may be off by some per cent: those of a film are only estimated, and light flickers.
+    Each equation is a mean over values of about the same white, because noise and dots that the camera partly resolves
+    would otherwise pull towards a curve that hides them.
 
     A page at another zoom, or a player, interpolates between the codes of black and white dots, which are less than
     the mean light. The share that is lost, `LOST`, hardly depends on the size, and is least where dots are fewest, so
@@ -112,10 +115,9 @@ def fit_camera_curve(seen: HalfTones, channels: int = 1) -> Fitted:
     if as_made is None or as_scaled is None:
         return Fitted(as_made and as_made.curve, scaled=False)
     scaled = as_scaled.left < CLEARLY * as_made.left
-    joint, shares = (as_scaled, _scaled(seen.shares)) if scaled else (as_made, seen.shares)
-    return Fitted(
-        joint.curve if channels == 1 else _of_channels(seen._replace(shares=shares), joint.curve), scaled
-    )
+    if scaled:  # what half-tones lose depends on the monitor's gamma, which may be another for each channel
+        return Fitted(as_scaled.curve, scaled=True)
+    return Fitted(as_made.curve if channels == 1 else _of_channels(seen, as_made.curve), scaled=False)
 
 
 def _of_channels(seen: HalfTones, joint: Curve) -> CameraCurve:
@@ -175,10 +177,13 @@ def _fit(seen: HalfTones) -> _Fit | None:
             axis=0,
         )
         kept = used & (off < (furthest or OUTLIER * np.median(off[used])))
-        if np.count_nonzero(kept) < MIN_VALUES or np.quantile(white.codes[0, kept], 0.99) < REACH:
+        if np.count_nonzero(kept) < MIN_VALUES:
+            return None
+        top = float(np.quantile(white.codes[0, kept], 0.99))
+        if top < REACH:
             return None
         equations, brighter = _equations(seen, np.flatnonzero(kept))
-        weights, left = _solve(equations @ basis, brighter, basis[-1:])
+        weights, left = _solve(equations @ basis, brighter, basis[-1:], top)
         light = np.maximum.accumulate(basis @ weights)
     codes = np.linspace(0, 1, SAMPLES, dtype=np.float32)
     named: list[Curve] = ["linear", "srgb"]
@@ -214,14 +219,15 @@ def _equations(seen: HalfTones, kept: NDArray[np.intp]) -> tuple[NDArray[np.floa
 
 
 def _solve(
-    rows: NDArray[np.float64], brighter: NDArray[np.float64], end: NDArray[np.float64]
+    rows: NDArray[np.float64], brighter: NDArray[np.float64], end: NDArray[np.float64], top: float
 ) -> tuple[NDArray[np.float64], float]:
-    """The weight of each knot, (KNOTS,), from equations, what exposures change in them, and the light at the end; and
-    the length of the residual.
+    """The weight of each knot, (KNOTS,), from equations, what exposures change in them, the light at the end, and the
+    brightest code that was seen; and the length of the residual.
     """
     from scipy.optimize import nnls  # takes half a second to import
 
     tones = brighter.shape[1]
+    usual = USUAL * (np.linspace(0, 1, KNOTS) > top)
     curved = SMOOTH * np.sqrt(len(rows) / KNOTS) * np.diff(np.eye(KNOTS), 2, axis=0)
     exposed = np.concatenate([brighter, -brighter], axis=1)  # of either sign
     A = np.block(
@@ -229,10 +235,11 @@ def _solve(
             [rows, exposed],
             [curved, np.zeros((len(curved), 2 * tones))],
             [np.zeros((2 * tones, KNOTS)), EXPOSED * np.eye(2 * tones)],
+            [np.diag(usual), np.zeros((KNOTS, 2 * tones))],
             [1e3 * end, np.zeros((1, 2 * tones))],
         ]
     )
-    weights, left = nnls(A, np.concatenate([np.zeros(len(A) - 1), [1e3]]))
+    weights, left = nnls(A, np.concatenate([np.zeros(len(A) - KNOTS - 1), usual, [1e3]]))
     return weights[:KNOTS], float(left)
 
 
