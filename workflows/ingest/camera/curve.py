@@ -34,8 +34,8 @@ EXPOSED = 2.0
 """Weight of relative errors of the half-tones' exposures, beside the relative errors of groups of values."""
 SMOOTH = 0.02
 """Weight of the curvature of the slopes; it decides where no value is."""
-USUAL = 0.05
-"""Weight of the slopes' difference from those of sRGB, beyond the brightest value."""
+USUAL = 0.5
+"""Weight of the slopes' difference from those of sRGB, times how far their code is beyond the brightest value."""
 DARK = 0.02
 """Light below which relative errors count no more."""
 
@@ -227,7 +227,7 @@ def _solve(
     from scipy.optimize import nnls  # takes half a second to import
 
     tones = brighter.shape[1]
-    usual = USUAL * (np.linspace(0, 1, KNOTS) > top)
+    usual = USUAL * np.maximum(np.linspace(0, 1, KNOTS) - top, 0)
     curved = SMOOTH * np.sqrt(len(rows) / KNOTS) * np.diff(np.eye(KNOTS), 2, axis=0)
     exposed = np.concatenate([brighter, -brighter], axis=1)  # of either sign
     A = np.block(
