@@ -33,7 +33,7 @@ what is left otherwise."""
 EXPOSED = 2.0
 """Weight of relative errors of the half-tones' exposures, beside the relative errors of groups of values."""
 SMOOTH = 0.02
-"""Weight of the curvature of the slopes; it decides where no value is."""
+"""Weight of the curvature of the slopes; it decides between values, and just beyond the brightest."""
 USUAL = 0.5
 """Weight of the slopes' difference from those of sRGB, times how far their code is beyond the brightest value."""
 DARK = 0.02
