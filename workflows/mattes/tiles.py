@@ -224,8 +224,9 @@ def patterns_of(objects: Objects, capture: str) -> Patterns:
     """A capture's patterns on a pyramid, as they arrive through its glare."""
     program, monitor = program_of(objects, capture)
     attributes = Stack(objects, capture).attributes
-    scaled, glare = (attributes.get(name) for name in ("scaled", "glare"))
-    patterns = lay_out(program, monitor, _images_of(objects, capture), scaled=bool(scaled))
+    scaled = attributes.get("scaled", False)  # missing from stacks of earlier versions, as glare is
+    patterns = lay_out(program, monitor, _images_of(objects, capture), scaled=scaled)
+    glare = attributes.get("glare")
     return filter_patterns(patterns, spread_patterns(patterns), glare) if glare else patterns
 
 

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 
 from workflows.images.tone_curves import Curve, to_light
 
-STEPS = 16
-"""Places along each side of a quarter of a pixel at which its light is worked out."""
+PLACES = 16
+"""Along each side of a quarter of a pixel, at which its light is worked out."""
 
 Floats = NDArray[np.float32]
 
@@ -48,7 +48,7 @@ def _quarters(curve: Curve) -> Floats:
 
     The indices say whether the pixel is white, its neighbour beside, the one above or below, and the one between these.
     """
-    off = (np.arange(STEPS) + 0.5) / (2 * STEPS)  # from the pixel's middle towards its edge
+    off = (np.arange(PLACES) + 0.5) / (2 * PLACES)  # from the pixel's middle towards its edge
     share = np.stack([1 - off, off])
     white = np.indices((2, 2, 2, 2)).reshape(2, 2, 16)  # which row, which column; all cases
     codes = np.einsum("rck,ri,cj->kij", white, share, share).astype(np.float32)

@@ -6,6 +6,7 @@ from scipy.ndimage import zoom
 
 from workflows.images.resample import area_mean, stretch
 from workflows.images.tone_curves import Curve, Gamma, to_light
+from workflows.ingest.camera.curve import LOST
 from workflows.programs.interpolation import interpolated_light
 from workflows.programs.parts import Halftone, Monitor
 
@@ -30,7 +31,7 @@ def test_plain_areas_and_what_lies_beyond_the_edges_are_unchanged() -> None:
     assert 0 < light[0, 3] < 1 - light[0, 4]
 
 
-@pytest.mark.parametrize(("level", "lost"), [(0.25, 0.087), (0.5, 0.159), (0.75, 0.089)])
+@pytest.mark.parametrize(("level", "lost"), LOST.items())
 def test_half_tones_lose_as_much_as_they_are_recognised_by(level: float, lost: float) -> None:
     dots = Halftone(kind="halftone", levels=(level,)).values(0, Monitor(width=128, height=96))
     picture = stretch(dots, 128, 96)[..., 0] > 0
