@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderLight
-from workflows.ingest.local_gain import Surroundings, surroundings
+from workflows.ingest.local_gain import DARK, DISPLAY, Surroundings, surroundings
 from workflows.ingest.trial.border_tone_mapping import Power, border_power
 from workflows.ingest.trial.trial_recovery import HUBER, Doubles, Sample
 from workflows.ingest.trial.unexplained import DETAIL, MIN_FLAT, Rest
@@ -21,6 +21,8 @@ SURE = 5.0
 """A power is real from so many standard errors on,"""
 LEAST = 0.02
 """and a smaller one is left out: it changes light by less than 3 %."""
+MIDDLE = 0.18**DISPLAY
+"""Brightness of surroundings that have a gain of 1: those of middle grey, for which cameras expose."""
 REWEIGHTED, SWEEPS = 5, 8
 """How often weights are updated, and sweeps over what is free at each update."""
 SPREAD = 0.01
@@ -80,12 +82,8 @@ def find_tone_mapping(
         return known | {"power": max(known["power"] + power, 0.0)}
     if power < max(SURE * error, LEAST):
         return None
-    around = near.at(*sample.places)
-    usual = float(around.mean())
-    if rest.white.size:
-        # Composites are exposed for a backdrop between patterns, half of which is black, and white.
-        usual = (usual + float(around[rest.white].mean())) / 2
-    return {"power": power, "width": width, "usual": usual, "spread": float(around.std())}
+    spread = float(near.at(*sample.places).std())
+    return {"power": power, "width": width, "usual": float(np.log(MIDDLE + DARK)), "spread": spread}
 
 
 def _power_of(rest: Rest, sample: Sample) -> Callable[[Surroundings], Power]:

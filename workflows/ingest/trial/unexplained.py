@@ -149,8 +149,6 @@ class Rest:
         at = slice(None, channels)
         first = {pattern: frame for frame, pattern in reversed(list(enumerate(stack.attributes["patterns"])))}
         self.frames = np.array([first.get(pattern, 0) for pattern in shown.tolist()])
-        numbers, sent = program.constants
-        self.white = np.flatnonzero(np.isin(stack.attributes["patterns"], numbers[(sent == 1).all(axis=1)]))
         light, usable, worth = (
             found.light.values[:, shown],
             found.light.usable[:, shown],

@@ -69,13 +69,13 @@ def test_an_s_shaped_curve_is_found(noise: float) -> None:
     assert np.abs(to_light(encoded(light, "contrasty"), "srgb") - light).max() > 0.05
 
 
-@pytest.mark.parametrize("gain", [0.15, 0.3, 0.6])
-def test_dark_frames_have_about_their_brightness(gain: float) -> None:
+@pytest.mark.parametrize("gain", [0.15, 0.3, 0.6, 0.9])
+def test_dark_frames_of_a_contrasty_camera_have_their_brightness(gain: float) -> None:
     found = fit(seen("contrasty", 0.002, (gain,) * 5))
     light = np.linspace(0.1, 0.8, 50, dtype=np.float32) * gain
     back = to_light(encoded(light, "contrasty"), found)  # type: ignore[arg-type]
     scale = (back @ light) / (light @ light)
-    assert scale == pytest.approx(1, abs=0.25)  # that is how far such a curve is from that of sRGB
+    assert scale == pytest.approx(1, abs=0.05)  # by the slopes of sRGB up to 1.15
     np.testing.assert_allclose(back / scale, light, atol=0.02 * gain)
 
 

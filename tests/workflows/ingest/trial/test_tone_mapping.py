@@ -79,7 +79,6 @@ def left_by(power: float, pixels: int = 400, frames: int = 40) -> tuple[Stack, R
     rest = SimpleNamespace(
         flat=rng.random(plain.shape) < 0.5,
         frames=np.arange(frames),
-        white=np.arange(0),
         level=level,
         plain=plain,
         rho=np.full(plain.shape, 0.6),
@@ -95,6 +94,7 @@ def test_power_is_that_of_the_residuals() -> None:
     assert found is not None
     assert found["power"] == pytest.approx(0.1, rel=0.05)
     assert found["width"] == 1 / 10
+    assert np.exp(found["usual"]) == pytest.approx(0.46 + 0.05, abs=0.005)  # middle grey, and what is added
 
 
 @pytest.mark.parametrize("power", [-0.1, 0.0, LEAST / 2])
