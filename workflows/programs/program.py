@@ -104,6 +104,11 @@ class Program(Record):
         ]
         return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
 
+    @property
+    def in_colour(self) -> bool:
+        """Whether any random pattern or stripes are in colour."""
+        return any(part.channels > 1 for part in self.parts if isinstance(part, Bernoulli | Stripes))
+
     @cached_property
     def halftones(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
         """Numbers of the half-tones, (k,) intp, and the share of white's light that they have, (k,) float32."""

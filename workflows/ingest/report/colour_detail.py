@@ -1,4 +1,4 @@
-"""The detail of colours that films lose: they store colour at half the resolution of brightness (4:2:0)."""
+"""The detail of colours that films and JPEGs lose: they store colour at half the resolution of brightness (4:2:0)."""
 
 import numpy as np
 from numpy.typing import NDArray

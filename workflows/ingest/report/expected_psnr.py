@@ -58,7 +58,7 @@ def expected(
     The squared error is modelled as ``k s^2 / m + c rho^2 / m^1.2``. The first term is noise of standard deviation s in
     about k parameters of T, S and rho. The second is what m patterns leave undetermined, in proportion to the contrast
     rho. What no T explains of the patterns is not explained of a backdrop either, and is added, as is the detail of
-    colours that a film has lost (`workflows.ingest.report.colour_detail`). If random patterns have
+    colours that frames have lost (`workflows.ingest.report.colour_detail`). If random patterns have
     offsets, m counts all patterns but the random ones without. Otherwise it counts all, and ``a rho^2 / n^b`` is added
     for n blocks along the monitor's shorter side in the finest grid: it is not known where in a block the light comes
     from, which costs clear glass most and frosted glass least.

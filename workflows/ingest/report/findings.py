@@ -8,7 +8,6 @@ import numpy as np
 from workflows.ingest.report.expected_psnr import costs_of, error_of
 from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
 from workflows.ingest.report.limits import (
-    coloured_patterns,
     curves,
     is_assumed,
     lost_colour,
@@ -40,7 +39,6 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *_exposure(figures, attributes["storage"]),
         *_auto_exposure(attributes.get("auto_exposure"), costs["auto_exposure"]),
         *_tone_mapping(attributes.get("tone_mapping")),
-        *coloured_patterns(program, half_colour=attributes.get("half_colour", False)),
         *_steadiness(attributes.get("steadiness")),
         *_drift(figures.drift),
         *_scaling(program, scaled=attributes.get("scaled", False)),
@@ -48,7 +46,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *_glare(attributes.get("glare")),
         _crosstalk(figures, program, grey=survey.get("grey", False)),
         *unexplained(costs["model_error"], error_of(attributes)),
-        *lost_colour(costs["lost_colour"]),
+        *lost_colour(program, costs["lost_colour"], half_colour=attributes.get("half_colour", False)),
         *_noise(figures, attributes, costs["noise"]),
         *_flicker(figures.flicker, mapped=bool(attributes.get("tone_mapping"))),
         _frames(figures),

@@ -7,7 +7,7 @@ import numpy as np
 
 from workflows.images.tone_curves import CameraCurve, Sampled, to_light
 from workflows.ingest.report.figures import Figures, Finding, Quality, graded
-from workflows.programs.program import Bernoulli, Images, Program, Stripes
+from workflows.programs.program import Images, Program
 
 SHOWS, SPOILS = 1e-4, 6e-3
 """Mean squares of errors, of full scale, from which on they show (40 dB), and spoil composites (22 dB)."""
@@ -65,33 +65,37 @@ def unexplained(cost: float, share: float) -> list[Finding]:
     ]
 
 
-def coloured_patterns(program: Program, *, half_colour: bool) -> list[Finding]:
-    """Patterns in colour that the frames have at half the resolution."""
-    coloured = any(isinstance(part, Bernoulli | Stripes) and part.channels > 1 for part in program.parts)
-    if not (half_colour and coloured):
-        return []
-    return [
-        Finding(
-            name="coloured_patterns",
-            level="warning",
-            message="the patterns are in colour, which these frames store at half the resolution: that costs "
-            "composites up to 6 dB",
-            remedy="shoot RAW, or show patterns in black and white: `envmatte patterns --grey`",
-        )
-    ]
+def lost_colour(program: Program, cost: float, *, half_colour: bool) -> list[Finding]:
+    """Detail of colours, of the patterns or else of the glass, that frames don't hold.
 
-
-def lost_colour(cost: float) -> list[Finding]:
-    """Detail of colours that a film has lost."""
-    if cost < SHOWS:
+    Parameters
+    ----------
+    program : Program
+    cost : float
+        The mean square error of composites by it.
+    half_colour : bool
+        Whether the frames are stills that store colours at half the resolution. (Films show no patterns in colour.)
+    """
+    limit = f"that alone limits composites to about {_dB(cost)} dB" if cost >= SHOWS else ""
+    if half_colour and program.in_colour:
+        return [
+            Finding(
+                name="coloured_patterns",
+                level=graded(cost, 0, SPOILS),
+                message="the patterns are in colour, which these frames store at half the resolution: "
+                + (limit or "that costs composites up to 8 dB"),
+                remedy="shoot RAW, or show patterns in black and white: `envmatte patterns --grey`",
+                cost=cost or None,
+            )
+        ]
+    if not limit:
         return []
     return [
         Finding(
             name="colour_detail",
             level="warning",
-            message="the colours of the glass are finer than a film stores them, at half the resolution: that alone "
-            f"limits composites to about {_dB(cost)} dB",
-            remedy="film the glass larger, or take stills",
+            message=f"the colours of the glass are finer than its frames store them, at half the resolution: {limit}",
+            remedy="let the glass fill more of the frame, or shoot RAW",
             cost=cost,
         )
     ]

@@ -13,6 +13,7 @@ from workflows.images.tone_curves import Gamma
 from workflows.ingest.report.figures import Finding, Quality, ToneCurve
 from workflows.ingest.report.limits import lost_colour, quality, unexplained
 from workflows.ingest.report.report import Report, report
+from workflows.programs.presets import preset
 from workflows.programs.program import Program
 from workflows.simulation.glass_ball import glass_ball
 
@@ -39,13 +40,28 @@ def test_errors_are_graded_by_their_cost(cost: float, level: str) -> None:
     (found,) = unexplained(cost, 0.03)
     assert (found.level, found.cost) == (level, cost)
     assert f"about {-10 * np.log10(cost):.0f} dB" in found.message
-    assert unexplained(1e-5, 0.003) == lost_colour(1e-5) == []
-    assert lost_colour(cost)[0].cost == cost
+    assert unexplained(1e-5, 0.003) == []
 
 
 @pytest.fixture(scope="module")
 def program() -> Program:
     return nested_program(MONITOR, bands=((8, 6, 12), (16, 12, 12), (32, 24, 12)), levels=2)
+
+
+def test_lost_detail_of_colours_is_that_of_patterns_in_colour_or_else_of_the_glass(program: Program) -> None:
+    (of_glass,) = lost_colour(program, 1e-3, half_colour=True)
+    assert (of_glass.name, of_glass.cost) == ("colour_detail", 1e-3)
+    assert lost_colour(program, 1e-5, half_colour=True) == []
+    coloured = preset("quick")
+    assert lost_colour(coloured, 0.0, half_colour=False) == []
+    for cost, level, said in (
+        (0.0, "warning", "up to 8 dB"),
+        (1e-3, "warning", "about 30 dB"),
+        (1e-2, "bad", "20 dB"),
+    ):
+        (of_patterns,) = lost_colour(coloured, cost, half_colour=True)
+        assert (of_patterns.name, of_patterns.level) == ("coloured_patterns", level)
+        assert said in of_patterns.message
 
 
 @pytest.fixture
