@@ -24,7 +24,7 @@ from tests.services.cluster.clusters import running
 pytestmark = pytest.mark.timeout(7200)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive  # the slow test that kills any process of a service kills workers, too
 def test_killed_worker(prepared: Prepared, table: list[Row], times: int) -> None:
     def kill() -> None:
         until(prepared.rig.workers)

@@ -21,8 +21,8 @@ SURE = 5.0
 """A power is real from so many standard errors on,"""
 LEAST = 0.02
 """and a smaller one is left out: it changes light by less than 3 %."""
-MIDDLE = 0.18**DISPLAY
-"""Brightness of surroundings that have a gain of 1: those of middle grey, for which cameras expose."""
+MIDDLE = 0.125**DISPLAY
+"""Brightness of surroundings that have a gain of 1: those for which light meters expose (ISO 2720, K = 12.5)."""
 REWEIGHTED, SWEEPS = 5, 8
 """How often weights are updated, and sweeps over what is free at each update."""
 SPREAD = 0.01
