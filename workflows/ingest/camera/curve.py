@@ -111,7 +111,7 @@ def fit_camera_curve(seen: HalfTones, channels: int = 1) -> Fitted:
     Usual is sRGB after an S curve, ``(1 - c) x + c x^2 (3 - 2 x)``: cameras add contrast c, so that their codes grow
     slowly where they are bright. F is the mean over several c, weighted by how likely they are (`USUAL_CONTRAST`) and
     by how well they explain the half-tones. Of 14 drawn cameras' JPEG stills of a ball, half of them dark, the scale
-    is so off by 3 % in the mean, and by 7 % if all c are 0.
+    is off by 3 % in the mean, and by 8 % if all c are 0.
 
     Each equation is a mean over values of about the same white, because noise and dots that the camera partly resolves
     would otherwise pull towards a curve that hides them.
