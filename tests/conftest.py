@@ -83,6 +83,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture(scope="session")
+def times(pytestconfig: pytest.Config) -> int:
+    return int(pytestconfig.getoption("--times"))
+
+
+@pytest.fixture(scope="session")
 def postgresql_server() -> Iterator[postgres.Server]:
     """A PostgreSQL server; skipped where none can be run."""
     with postgres.server() as server, server.database(postgres.TEMPLATE) as url:

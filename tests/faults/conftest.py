@@ -19,11 +19,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 @pytest.fixture(scope="session")
-def times(pytestconfig: pytest.Config) -> int:
-    return int(pytestconfig.getoption("--times"))
-
-
-@pytest.fixture(scope="session")
 def fewer_times(times: int) -> int:
     """How often faults that take half a minute are injected."""
     return max(1, times // 2)

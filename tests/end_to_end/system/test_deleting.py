@@ -26,7 +26,6 @@ from tests.parts.inputs.hostile_mattes import large_matte
 from tests.parts.waiting import until
 
 READERS = 6
-ROUNDS = 3
 EDGE = 512
 """Of a matte's frame: its layers take some tenths of a second, so some are under way when it is deleted."""
 FRAME = 3000
@@ -101,11 +100,11 @@ def made(service: Service, capture: str) -> Iterator[Made]:
     ],
 )
 def test_what_is_deleted_under_its_readers_is_not_found(
-    service: Service, made: Made, what: str, path: str
+    service: Service, made: Made, what: str, path: str, times: int
 ) -> None:
     make: Callable[[str], None] = getattr(made, what)
     answers: Counter[object] = Counter()
-    for _ in range(ROUNDS):
+    for _ in range(times):
         id = new_id()
         make(id)
         address = path.format(id=id)
@@ -134,4 +133,4 @@ def test_what_is_deleted_under_its_readers_is_not_found(
             reader.join()
     print(f"\n{path}: {dict(answers)}")
     assert answers.keys() <= {200, 404, "cut off"}
-    assert answers[404] == ROUNDS * READERS
+    assert answers[404] == times * READERS
