@@ -84,6 +84,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session")
 def times(pytestconfig: pytest.Config) -> int:
+    """How often each fault is injected."""
     return int(pytestconfig.getoption("--times"))
 
 

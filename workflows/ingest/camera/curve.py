@@ -47,6 +47,8 @@ DARK = 0.02
 
 Floats = NDArray[np.float32]
 
+_CODES = np.linspace(0, 1, SAMPLES, dtype=np.float32)
+
 
 class Shown(NamedTuple):
     """Frames of one light: codes, 0 to 1, of n pixels and channels, (frames, n) float32, and the exposure of each.
@@ -90,8 +92,7 @@ class _Fit(NamedTuple):
 
     def misfit(self, curve: Curve) -> float:
         """The squared error of a curve in these equations."""
-        codes = np.linspace(0, 1, SAMPLES, dtype=np.float32)
-        return float(np.sum((self.equations @ to_light(codes, curve)) ** 2))
+        return float(np.sum((self.equations @ to_light(_CODES, curve)) ** 2))
 
 
 def fit_camera_curve(seen: HalfTones, channels: int = 1) -> Fitted:
@@ -178,7 +179,8 @@ def _fit(seen: HalfTones) -> _Fit | None:
     used = (
         (grey > 0).all(axis=0) & (grey < 1).all(axis=0) & (ends < 1).all(axis=0) & (contrast > MIN_CONTRAST)
     )
-    light = to_light(np.linspace(0, 1, SAMPLES, dtype=np.float32), "srgb").astype(np.float64)
+    light = to_light(_CODES, "srgb").astype(np.float64)
+    bases, knots = list(map(_basis, CONTRASTS)), np.linspace(0, 1, KNOTS)
     for furthest in (FURTHEST, None):
         # The border of a film, a hand, a reflection: what does not follow the half-tones is no part of the monitor.
         low, high = _light_of(black, light), _light_of(white, light)
@@ -195,13 +197,11 @@ def _fit(seen: HalfTones) -> _Fit | None:
         bottom, top = np.quantile(black.codes[0, kept], 0.01), np.quantile(white.codes[0, kept], 0.99)
         if top < REACH:
             return None
-        knots = np.linspace(0, 1, KNOTS)
         unseen = np.maximum(np.maximum(knots - top, bottom - knots), 0)
         equations, brighter = _equations(seen, np.flatnonzero(kept))
-        light, left = _most_likely(equations, brighter, unseen)
-    codes = np.linspace(0, 1, SAMPLES, dtype=np.float32)
+        light, left = _most_likely(equations, brighter, bases, unseen)
     named: list[Curve] = ["linear", "srgb"]
-    misfit = [float(np.sqrt(np.mean((equations @ to_light(codes, curve)) ** 2))) for curve in named]
+    misfit = [float(np.sqrt(np.mean((equations @ to_light(_CODES, curve)) ** 2))) for curve in named]
     if min(misfit) < AGREES:
         return _Fit(named[int(np.argmin(misfit))], left, equations)
     return _Fit(Sampled(light=tuple((light / light[-1]).round(6).tolist())), left, equations)
@@ -233,14 +233,16 @@ def _equations(seen: HalfTones, kept: NDArray[np.intp]) -> tuple[NDArray[np.floa
 
 
 def _most_likely(
-    equations: NDArray[np.float64], brighter: NDArray[np.float64], unseen: NDArray[np.float64]
+    equations: NDArray[np.float64],
+    brighter: NDArray[np.float64],
+    bases: list[NDArray[np.float64]],
+    unseen: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
     """The samples of the curve, (SAMPLES,), and the length of the least residual, from equations, what exposures change
-    in them, and how far each knot is from the codes that were seen.
+    in them, the basis of each of the `CONTRASTS`, and how far each knot is from the codes that were seen.
     """
     curves, left = [], []
-    for contrast in CONTRASTS:
-        basis = _basis(contrast)
+    for basis in bases:
         weights, residual = _solve(equations @ basis, brighter, basis[-1:], unseen)
         curves.append(np.maximum.accumulate(basis @ weights))
         left.append(residual)
@@ -279,11 +281,10 @@ def _solve(
 
 def _basis(contrast: float) -> NDArray[np.float64]:
     """The light at each sample of the curve for a weight of 1 at each knot, (SAMPLES, KNOTS)."""
-    codes = np.linspace(0, 1, SAMPLES, dtype=np.float32)
     even = np.linspace(0, 1, 16 * SAMPLES)
-    plain = np.interp(codes, (1 - contrast) * even + contrast * even**2 * (3 - 2 * even), even)
+    plain = np.interp(_CODES, (1 - contrast) * even + contrast * even**2 * (3 - 2 * even), even)
     rise = np.diff(to_light(plain.astype(np.float32), "srgb").astype(np.float64))
-    middle = (codes[1:] + codes[:-1]) / 2
+    middle = (_CODES[1:] + _CODES[:-1]) / 2
     knots = np.linspace(0, 1, KNOTS)
     hats = np.stack([np.interp(middle, knots, row) for row in np.eye(KNOTS)], axis=1)
     return np.concatenate([np.zeros((1, KNOTS)), np.cumsum(rise[:, np.newaxis] * hats, axis=0)])

@@ -28,8 +28,7 @@ COLOUR_FRAMES = 16
 """Patterns, at most, from which the lost detail of colours is estimated."""
 COLOURED = 0.25
 """Share of what patterns in colour lose that composites lose, since T is found from many, beside what counts as an
-error of the model: by this share, JPEG stills of five drawn cameras reach what is promised within 2.1 dB.
-"""
+error of the model: by this share, JPEG stills of five cameras are within 2.1 dB of the range that is promised."""
 BATCH = 32 << 20
 """About how many bytes of a window's frames are read at a time."""
 
