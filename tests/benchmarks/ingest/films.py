@@ -23,6 +23,7 @@ from typing import Any
 import av
 import numpy as np
 import psutil
+from av.video.reformatter import ColorRange
 from numpy.typing import NDArray
 
 from services.cli.demo_run import service
@@ -93,14 +94,14 @@ def seen(shown: Path, fps: int) -> Iterator[NDArray[np.uint8]]:
         number, noise = 0, np.zeros((FIELDS, stream.height, stream.width), np.float32)
         noise[:] = rng.normal(0, NOISE, noise.shape)
         for frame in video.decode(stream):
-            picture = np.asarray(frame.to_ndarray(format="yuv420p"), np.uint8)
+            narrow = frame.reformat(format="yuv420p", dst_color_range=ColorRange.MPEG)  # as cameras record
+            picture = np.asarray(narrow.to_ndarray(), np.uint8)
             assert frame.time is not None
             until = frame.time + float(1 / (stream.average_rate or 1))
             while number / fps < until:
                 luma = GAIN * picture[: stream.height] + OFFSET + noise[number % FIELDS]
-                filmed = picture.copy()
-                filmed[: stream.height] = np.clip(luma, 0, 255)
-                yield filmed
+                colours = GAIN * (picture[stream.height :] - 128.0) + 128
+                yield np.clip(np.concatenate([luma, colours]), 0, 255).astype(np.uint8)
                 number += 1
 
 

@@ -33,6 +33,9 @@ SHOULDER = 0.93
 """Codes from here on are left out: cameras compress what is nearly white."""
 LEAST = 0.01
 """Light below which a value says nothing."""
+LEAST_SPREAD = 100.0
+"""Weighted squares of what the light of a frame's usable values differs by: with less, its exposure has a standard error
+of over 10 %, and is taken for the usual one."""
 TRIFLE = 0.003
 """A standard deviation of the exposures below this is none."""
 
@@ -181,7 +184,8 @@ def _spread(
 def _lines(predicted: Doubles, light: Doubles, weight: Doubles, veiled: bool) -> tuple[Doubles, Doubles]:
     """The exposure and the veil of each frame, (frames, 1): ``light = exposure (predicted + veil)``, by least squares.
 
-    A frame without usable values has an exposure of 1 and no veil; no frame has one unless they are ``veiled``.
+    A frame whose usable values are too few, or too much alike, has an exposure of 1 and no veil; no frame has one unless
+    they are ``veiled``.
     """
     x = y = np.zeros((len(light), 1))
     if veiled:
@@ -190,9 +194,10 @@ def _lines(predicted: Doubles, light: Doubles, weight: Doubles, veiled: bool) ->
     off = predicted - x
     spread = (weight * off**2).sum(axis=1, keepdims=True)
     slope = (weight * off * (light - y)).sum(axis=1, keepdims=True) / np.maximum(spread, 1e-12)
-    exposure = np.where(spread > 0, slope, 1)
+    known = spread >= LEAST_SPREAD
+    exposure = np.where(known, slope, 1)
     exposure = np.maximum(exposure / np.median(exposure), 1e-3)
-    return exposure, np.where(veiled & (spread > 0), y / exposure - x, 0)
+    return exposure, np.where(veiled & known, y / exposure - x, 0)
 
 
 def shortest_white(exposures: Doubles, patterns: Sequence[int], program: Program) -> int | None:

@@ -33,6 +33,7 @@ class Film:
         veil: NDArray[np.floating] | float = 0.0,
         between: bool = False,
         clipped: bool = False,
+        contrasty: bool = False,
         dark: int = 0,
     ) -> None:
         random = np.random.default_rng(2)
@@ -44,7 +45,11 @@ class Film:
         if border:
             lit = border_light(range(PROGRAM.count))[:, missing:] > 0
             of_column = lit[np.arange(80) // 4 % len(lit)]  # a cell is four pixels wide
-            light[:, :5] = light[:, 55:] = np.where(of_column, 0.3, 0.03).T[:, np.newaxis, :, np.newaxis]
+            shown = np.where(of_column, 0.3, 0.03)
+            if contrasty:  # only edges of cells are neither black nor nearly white
+                shown = np.where(of_column, 0.97, -0.1)
+                shown[::8] = (shown[::8] + np.roll(shown, -4, axis=0)[::8]) / 2
+            light[:, :5] = light[:, 55:] = shown.T[:, np.newaxis, :, np.newaxis]
             if between:  # four rows see the patterns' edge too
                 light[:, 5:9] = 0.7 * light[:, :1] + 0.1 * random.random((self.frames, 1, 1, 1))
         light += np.broadcast_to(veil, PROGRAM.count)[missing:, np.newaxis, np.newaxis, np.newaxis]
@@ -93,6 +98,12 @@ def test_values_that_see_the_edge_of_the_patterns_hardly_count() -> None:
     found = BorderValues(film, PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
     assert found is not None
     assert np.log(found).std() < TRIFLE
+
+
+def test_exposures_are_not_told_by_a_few_edges_of_a_border_of_black_and_white() -> None:
+    found = BorderValues(Film(np.ones(200), contrasty=True), PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
+    assert found is not None
+    np.testing.assert_allclose(found, 1, rtol=0.02)
 
 
 def test_light_of_the_border_is_told_apart_from_the_veil() -> None:
