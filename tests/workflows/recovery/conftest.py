@@ -1,7 +1,6 @@
 """Small programs, and what a camera sees of them through a known T."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -94,7 +93,7 @@ def _spoil(
     rho[8] = 1e-12
     S[9], rho[10] = np.nan, np.nan
     S[11] = 50
-    return measurements, replace(photometry, S=S, rho=rho)
+    return measurements, photometry._replace(S=S, rho=rho)
 
 
 @pytest.fixture

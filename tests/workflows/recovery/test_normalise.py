@@ -1,7 +1,5 @@
 """Measurements in units of T and back: their form, S and rho once more, the error to expect."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -57,7 +55,7 @@ def test_measurements_of_other_pixels_are_refused(photometry):
 
 def test_refit_is_weighted_least_squares_in_camera_values(photometry):
     # known too badly to hold the fit back
-    photometry = replace(photometry, black=np.full((2, 3), 4e-4), white=np.full((2, 3), 4e-4))
+    photometry = photometry._replace(black=np.full((2, 3), 4e-4), white=np.full((2, 3), 4e-4))
     rng = np.random.default_rng(0)
     m, kappa = 30, np.zeros((2, 3))
     kappa[1, 1] = 0.05

@@ -34,8 +34,8 @@ SHOULDER = 0.93
 LEAST = 0.01
 """Light below which a value says nothing."""
 LEAST_SPREAD = 100.0
-"""Weighted squares of what the light of a frame's usable values differs by: with less, its exposure has a standard error
-of over 10 %, and is taken for the usual one."""
+"""Weighted squares of what the light of a frame's usable values differs by: with less, its exposure has a standard
+error of over 10 %, and is taken for the usual one."""
 TRIFLE = 0.003
 """A standard deviation of the exposures below this is none."""
 
@@ -184,8 +184,8 @@ def _spread(
 def _lines(predicted: Doubles, light: Doubles, weight: Doubles, veiled: bool) -> tuple[Doubles, Doubles]:
     """The exposure and the veil of each frame, (frames, 1): ``light = exposure (predicted + veil)``, by least squares.
 
-    A frame whose usable values are too few, or too much alike, has an exposure of 1 and no veil; no frame has one unless
-    they are ``veiled``.
+    A frame whose usable values are too few, or too much alike, has an exposure of 1 and no veil; no frame has one
+    unless they are ``veiled``.
     """
     x = y = np.zeros((len(light), 1))
     if veiled:

@@ -256,7 +256,7 @@ def recover_seen(
 
     def recover_part(first: int) -> None:
         at = slice(first, first + firsts.step)
-        of_part = Photometry(*(values[at] for values in vars(photometry).values()))
+        of_part = Photometry(*(values[at] for values in photometry))
         parts[first] = recover(
             measurements[at], of_part, patterns, noise, used[at], worth[at], options, conditions, places
         )
@@ -270,10 +270,9 @@ def recover_seen(
 def _joined(parts: list[Recovery]) -> Recovery:
     """The recovery of the pixels of all parts, in order."""
     transports, photometries, errors, strays = zip(*parts, strict=True)
-    fields = zip(*(vars(photometry).values() for photometry in photometries), strict=True)
     return Recovery(
         Transport.concatenate(transports),
-        Photometry(*map(np.concatenate, fields)),
+        Photometry(*map(np.concatenate, zip(*photometries, strict=True))),
         np.concatenate(errors),
         None if strays[0] is None else np.concatenate(strays),
     )

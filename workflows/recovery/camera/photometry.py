@@ -1,6 +1,6 @@
 """S and rho of each pixel, the camera's noise and its crosstalk, estimated from frames of constant monitors."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ _WHITE = 1e-4
 _MOST_CROSSTALK = 0.9
 
 
-@dataclass(frozen=True)
-class Photometry:
+class Photometry(NamedTuple):
     """S and rho of n pixels (eq. 5): light not from the monitor, and transparency.
 
     Attributes

@@ -158,7 +158,7 @@ def recover(
         photometry, less_certain(measured, conditions.model_error), found.response, found.kappa
     )
     if conditions.grey:
-        better = Photometry(*(np.repeat(values[:, :1], 3, axis=1) for values in vars(better).values()))
+        better = Photometry(*(np.repeat(values[:, :1], 3, axis=1) for values in better))
     error = expected_error(better, measured, found.misfit)
     return Recovery(transport, better, error, stray)
 

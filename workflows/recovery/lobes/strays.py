@@ -88,8 +88,8 @@ def find_strong_strays(
         covariance[:, 0, 0],
         np.einsum("i,nij,j->n", white, covariance[:, :2, :2], white),
     )
-    better = Photometry(*(old.astype(np.float32) for old in vars(photometry).values()))
-    for of_all, of_strong in zip(vars(better).values(), fitted, strict=True):
+    better = Photometry(*(old.astype(np.float32) for old in photometry))
+    for of_all, of_strong in zip(better, fitted, strict=True):
         of_all[strong] = of_strong
     return stray.transpose(0, 2, 1), better
 

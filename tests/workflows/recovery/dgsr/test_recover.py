@@ -117,7 +117,7 @@ def test_result_does_not_depend_on_the_batch(recover, sensing_of, observe, colou
     whole = recover(measurements, photometry, sensing, noise)
     order = np.random.default_rng(0).permutation(len(truth))
     for part in (order, order[:7], order[7:8]):
-        own = Photometry(*(array[part] for array in vars(photometry).values()))
+        own = Photometry(*(array[part] for array in photometry))
         alone = recover(measurements[part], own, sensing, noise)
         np.testing.assert_array_equal(alone.count, whole.count[part])
         np.testing.assert_array_equal(dense(alone), dense(whole)[part])

@@ -69,7 +69,7 @@ def recovered(patterns, scene, options=FINE):
 
 
 def part_of(photometry, part):
-    return Photometry(*(array[part] for array in vars(photometry).values()))
+    return Photometry(*(array[part] for array in photometry))
 
 
 @pytest.mark.parametrize("colours", ["patterns", "coloured"])
