@@ -16,6 +16,7 @@ from workflows.jobs import Steps, Task
 from workflows.mattes import preview, tiles
 from workflows.mattes.cut_out import CutOut, find_object
 from workflows.mattes.options import RecoveryOptions, parse_options
+from workflows.programs.program import Program
 
 
 def prepare(objects: Objects, task: Task) -> dict[str, Any]:
@@ -44,7 +45,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         crosstalk=stack.attributes["crosstalk"],
         # Without the size of tiles, which changes nothing in the matte; of whole frames as earlier versions wrote them.
         options=options.model_dump(mode="json", exclude={"tile"} if options.cut_out else {"tile", "cut_out"}),
-        **_interval(stack, options),
+        **_interval(stack, program, options),
     )
     matte = create()
     is_cut_out, notes = options.cut_out and bool(stack.mask().all()), []
@@ -75,19 +76,19 @@ def _cut_out(objects: Objects, matte: str, spacing: int | None) -> CutOut:
     return find_object(Matte(objects, mattes.preview_of(matte)), spacing, whole.height, whole.width)
 
 
-def _interval(stack: Stack, options: RecoveryOptions) -> dict[str, Any]:
+def _interval(stack: Stack, program: Program, options: RecoveryOptions) -> dict[str, Any]:
     """The attribute ``interval`` of a matte, if the ingest has tried these options.
 
-    To what patterns that are held out show, it adds what they can't: the detail of colours that a film has lost, and
-    the exposure at which the scene is to be shown, if the camera's was not locked.
+    To what patterns that are held out show, it adds what grey ones can't, the detail of colours that frames have lost,
+    and what none can, the exposure at which the scene is to be shown, if the camera's was not locked.
     """
     quality = next((name for name, tried in QUALITIES.items() if tried == options.of_method), None)
     found = stack.attributes.get("intervals", {}).get(quality)
     if not found:
         return {}
-    read = found["read"] + stack.attributes["survey"].get("lost_colour", 0.0)
+    lost = 0.0 if program.in_colour else stack.attributes["survey"].get("lost_colour", 0.0)
     share = found["share"] + exposure_error(stack.attributes.get("auto_exposure"))
-    return {"interval": found | {"read": read, "share": share}}
+    return {"interval": found | {"read": found["read"] + lost, "share": share}}
 
 
 def work(objects: Objects, task: Task, tile: int) -> int:

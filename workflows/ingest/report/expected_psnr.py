@@ -20,6 +20,10 @@ BACKDROP = 1 / 3
 _NOISE = (19.0, 0.040), (5.5, 0.0044)  # k and c at the low and the high end
 _OTHER = 3.0, -5.0  # dB by which composites are worse than patterns at the low end, and at the high end
 _EXPOSED = 2.9, 0.5  # of `EXPOSURE_LEFT` at the low and the high end
+_IN_COLOUR = (
+    1.0,
+    0.5,
+)  # of what is not explained, if the colours of patterns lost detail, at the low and the high end
 _FIXED_GRIDS = (0.45, 1.2), (0.00045, 0.35)  # a and b at the low and the high end
 
 
@@ -58,7 +62,8 @@ def expected(
     The squared error is modelled as ``k s^2 / m + c rho^2 / m^1.2``. The first term is noise of standard deviation s in
     about k parameters of T, S and rho. The second is what m patterns leave undetermined, in proportion to the contrast
     rho. What no T explains of the patterns is not explained of a backdrop either, and is added, as is the detail of
-    colours that frames have lost (`workflows.ingest.report.colour_detail`). If random patterns have
+    colours that frames have lost (`workflows.ingest.report.colour_detail`): half of it at the high end if it is the
+    patterns' own, which T averages, most where it is wide. If random patterns have
     offsets, m counts all patterns but the random ones without. Otherwise it counts all, and ``a rho^2 / n^b`` is added
     for n blocks along the monitor's shorter side in the finest grid: it is not known where in a block the light comes
     from, which costs clear glass most and frosted glass least.
@@ -83,6 +88,7 @@ def expected(
     rho, s2 = survey["contrast"], survey["deviation"] ** 2
     costs = costs_of(program, patterns, survey, model_error, exposures)
     unexplained = costs["model_error"] + costs["lost_colour"]
+    lost_colours = program.in_colour and costs["lost_colour"] > 0
     counts, _ = np.histogram(np.unique(patterns), program.starts)
     shown = [
         (part, int(count))
@@ -99,8 +105,9 @@ def expected(
     measured = sum(count for part, count in shown if fixed or not isinstance(part, Bernoulli) or part.offset)
     blocks = max(min(part.columns, part.rows) for part in random) if fixed else None
     ends = []
-    for (k, c), (a, b), exposed in zip(_NOISE, _FIXED_GRIDS, _EXPOSED, strict=True):
-        error = k * s2 / measured + c * rho**2 / measured**1.2 + unexplained
+    for (k, c), (a, b), exposed, share in zip(_NOISE, _FIXED_GRIDS, _EXPOSED, _IN_COLOUR, strict=True):
+        error = k * s2 / measured + c * rho**2 / measured**1.2
+        error += unexplained * (share if lost_colours else 1)
         error += exposed**2 * costs["auto_exposure"]
         ends.append(-10 * log10(error if blocks is None else error + a * rho**2 / blocks**b))
     return Quality(low=ends[0], high=ends[1], blocks=blocks)

@@ -21,6 +21,9 @@ MOST_HELD_OUT = 10
 """Patterns that are predicted, about: their contrast takes time too."""
 PIXELS = 320
 """Pixels, at most, that are recovered without them."""
+COLOURED = 0.7
+"""How much narrower those of JPEG and HEIC stills with patterns in colour are: these are stored at half the resolution,
+by which what was held out is farther from the truth than T, which is found from many."""
 SHARPENED = 1.35
 """How much wider a film's intervals are: cameras sharpen films by an amount that can't be measured, since patterns are
 sharpened as the glass is."""
@@ -129,6 +132,8 @@ def _interval(
         float(np.median(found.light.worth[:, program.measured].sum(axis=1))),
         (model_error, float(attributes["smooth_error"])),
     )
+    if program.in_colour and attributes.get("half_colour"):
+        fitted = fitted.wider(COLOURED)
     return fitted.wider(SHARPENED) if attributes.get("video") else fitted
 
 

@@ -11,7 +11,7 @@ from workflows.ingest.camera.border_exposure import BorderLight
 from workflows.ingest.local_gain import DARK, DISPLAY, Surroundings, surroundings
 from workflows.ingest.trial.border_tone_mapping import Power, border_power
 from workflows.ingest.trial.trial_recovery import HUBER, Doubles, Sample
-from workflows.ingest.trial.unexplained import DETAIL, MIN_FLAT, Rest
+from workflows.ingest.trial.unexplained import DETAIL, MIN_FLAT, SEEN, Rest
 
 WIDTHS = (1 / 40, 1 / 20, 1 / 10)
 """Widths of the surroundings that are tried, as shares of the frame's width,"""
@@ -62,13 +62,17 @@ def find_tone_mapping(
     is larger by ``-p log(m) C``. Where a pixel sees a pattern as all black or all white, there is no error of T's place
     or shape that could look alike, and the values of one pixel are alike too, so that no error of the camera's curve
     does. Of the residuals there, each pixel's mean and each frame's gain are left free: S, rho and flicker are
-    uncertain. T has explained some of the rest, so that what is found is corrected, and searched for once more.
-    Sharpening is far narrower than the surroundings, and glare makes a place that is bright around not darker but
-    brighter. The border of a film has light that no T has to explain (`border_power`).
+    uncertain. Under patterns in colour, a channel is all black or all white while the others are not, and surroundings
+    are the brighter, the brighter these are. So only values count of which all three channels are black or white, and
+    what a channel sees of each of the others is left free too. T has explained some of the rest, so that what is found
+    is corrected, and searched for once more. Sharpening is far narrower than the surroundings, and glare makes a place
+    that is bright around not darker but brighter. The border of a film has light that no T has to explain
+    (`border_power`).
     """
     widths = [known["width"]] if known else [w for w in WIDTHS if w * stack.width >= NARROWEST]
     tried = [(width, near) for width in widths if (near := surroundings(stack, width)) is not None]
-    ways = [_power_of(rest, sample)] if np.count_nonzero(rest.flat) >= MIN_FLAT else []
+    flat = rest.flat & (np.abs(rest.plain) > SEEN).all(axis=1, keepdims=True)
+    ways = [_power_of(rest, flat, sample)] if np.count_nonzero(flat) >= MIN_FLAT else []
     if border is not None:
         ways.append(partial(border_power, border))
     if not tried or not ways:
@@ -86,9 +90,8 @@ def find_tone_mapping(
     return {"power": power, "width": width, "usual": float(np.log(MIDDLE + DARK)), "spread": spread}
 
 
-def _power_of(rest: Rest, sample: Sample) -> Callable[[Surroundings], Power]:
-    """A function from surroundings to the power that the residuals of a sample show."""
-    at = rest.flat
+def _power_of(rest: Rest, at: NDArray[np.bool_], sample: Sample) -> Callable[[Surroundings], Power]:
+    """A function from surroundings to the power that some residuals of a sample, (n, channels, m), show."""
     pixel, channel, shown = np.nonzero(at)
     frame = rest.frames[shown]
     level, value = rest.level[at], (rest.rest * rest.rho)[at] / 2
@@ -96,6 +99,9 @@ def _power_of(rest: Rest, sample: Sample) -> Callable[[Surroundings], Power]:
     weight = 1 / np.sqrt(rest.noise.variance(level) + (SPREAD * level) ** 2 + detail)
     group = 2 * (pixel * at.shape[1] + channel) + (rest.plain[at] > 0)
     free = [(group, weight), (shown, weight * level)]
+    for further in range(1, at.shape[1]):
+        other = (channel + further) % at.shape[1]
+        free.append((at.shape[1] * channel + other, weight * rest.rho[at] * rest.plain[pixel, other, shown]))
     clusters = [sample.chosen[0][pixel], shown]
 
     def power(near: Surroundings) -> Power:

@@ -138,3 +138,11 @@ def test_colours_that_a_film_has_lost_are_not_promised() -> None:
     found = expect(program, SURVEY | {"lost_colour": 1e-3}, 0.0)
     assert found is not None
     assert 29 < found.low < found.high < 30
+
+
+def test_colours_that_patterns_have_lost_cost_wide_rows_of_t_less() -> None:
+    survey = SURVEY | {"lost_colour": 1e-3}
+    grey, coloured = (expect(preset(name), survey, 0.02) for name in ("default", "quick"))
+    assert grey is not None
+    assert coloured is not None
+    assert coloured.high - coloured.low > grey.high - grey.low + 2

@@ -55,8 +55,14 @@ def filmed(scene: Scene, program: Program, power: float = 0.0, sharpening: float
     return captured(program, see)
 
 
-def left_by(power: float, pixels: int = 400, frames: int = 40) -> tuple[Stack, Rest, Sample]:
-    """Residuals of pixels that see patterns as all black or all white, by a camera that maps tones."""
+def left_by(
+    power: float, pixels: int = 400, frames: int = 40, *, mixed: float = 0.0, smeared: float = 0.0
+) -> tuple[Stack, Rest, Sample]:
+    """Residuals of pixels that see patterns as all black or all white, by a camera that maps tones.
+
+    Where it is ``mixed``, patterns in colour are brighter in bright surroundings, and a channel sees so much of the
+    others. Where it is ``smeared``, a fifth of the values are neither, which changes those of the other channels.
+    """
     rng = np.random.default_rng(1)
     thumbnails = gaussian_filter(rng.random((frames, 60, 80)), (0, 6, 6))
     thumbnails = np.clip(0.5 + (thumbnails - thumbnails.mean()) * 0.25 / thumbnails.std(), 0, 1)
@@ -73,11 +79,17 @@ def left_by(power: float, pixels: int = 400, frames: int = 40) -> tuple[Stack, R
     y, x = rng.integers(0, 240, pixels), rng.integers(0, 320, pixels)
     around = near.at(y, x) - near.values.mean()
     plain = rng.choice([-1.0, 1.0], (pixels, 3, frames))
+    if mixed:
+        plain = np.sign(around.T[:, np.newaxis] / around.std() + 2 * rng.standard_normal(plain.shape))
+    between = rng.random(plain.shape) < (0.2 if smeared else 0)
+    plain[between] *= 0.5
     level = 0.03 + 0.3 * (1 + plain)
     flicker = 1 + 0.01 * rng.standard_normal(frames)
     seen = level * (flicker * np.exp(-power * around.T[:, np.newaxis]) - 1)
+    seen += mixed * (plain.sum(axis=1, keepdims=True) - plain)
+    seen += smeared * around.T[:, np.newaxis] * between.any(axis=1, keepdims=True)
     rest = SimpleNamespace(
-        flat=rng.random(plain.shape) < 0.5,
+        flat=(rng.random(plain.shape) < 0.5) & ~between,
         frames=np.arange(frames),
         level=level,
         plain=plain,
@@ -95,6 +107,13 @@ def test_power_is_that_of_the_residuals() -> None:
     assert found["power"] == pytest.approx(0.1, rel=0.05)
     assert found["width"] == 1 / 10
     assert np.exp(found["usual"]) == pytest.approx(0.39 + 0.05, abs=0.005)  # middle grey, and what is added
+
+
+@pytest.mark.parametrize("power", [0.0, 0.1])
+@pytest.mark.parametrize("by_colours", [{"mixed": 0.05}, {"smeared": 0.05}])
+def test_what_other_colours_do_is_told_apart(power: float, by_colours: dict[str, float]) -> None:
+    found = find_tone_mapping(*left_by(power, **by_colours), None)
+    assert (found and found["power"]) == (pytest.approx(power, rel=0.1) if power else None)
 
 
 @pytest.mark.parametrize("power", [-0.1, 0.0, LEAST / 2])
