@@ -22,9 +22,10 @@ from workflows.ingest.trial.trial_recovery import (
     Sample,
     Trial,
     measure_rest,
+    take_sample,
     try_recovery,
 )
-from workflows.ingest.trial.unexplained import Unexplained, find_unexplained
+from workflows.ingest.trial.unexplained import MEASURED, Unexplained, find_unexplained
 from workflows.ingest.trial.white_exposure import find_white_excess
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
@@ -230,27 +231,34 @@ def _explain(
 ) -> tuple[Curve, Patterns, Unexplained] | None:
     """Find what T leaves unexplained, local tone mapping first; None if the sample has too little contrast.
 
+    Pixels that see the bare monitor tell tone mapping better than those of glass, whose T explains some of it: a mask
+    does not count.
+
     Returns
     -------
     Curve, Patterns
         The monitor's curve, and the patterns' light by it, without glare.
     Unexplained
     """
+    wide = sample if stack.mask().all() else take_sample(stack, masked=False) or sample
     at_rest, turn = np.zeros((stack.frames, 3)), 0
     while True:
         monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
         light = lay_out(program, monitor, stack.images(), scaled=stack.attributes["scaled"])
-        found = find_unexplained(stack, program, monitor, light, sample, at_rest)
-        if found is None:
-            return None
+        measured = {name: stack.attributes[name] for name in MEASURED}
+        found = find_unexplained(stack, program, monitor, light, wide, at_rest)
         mapped = None
-        if turn < TONE_MAPPING_TURNS:
+        if found is not None and turn < TONE_MAPPING_TURNS:
             known = stack.attributes["tone_mapping"]
-            mapped = find_tone_mapping(stack, found.rest, sample, known, _border_light(stack, border))
+            mapped = find_tone_mapping(stack, found.rest, wide, known, _border_light(stack, border))
         if mapped is None:
-            return monitor, light, found
+            break
         measure(stack, border, tone_mapping=mapped)
         turn += 1
+    if wide is not sample:
+        stack.annotate(**measured)
+        found = find_unexplained(stack, program, monitor, light, sample, at_rest)
+    return None if found is None else (monitor, light, found)
 
 
 def _border_light(stack: Stack, border: BorderValues | None) -> BorderLight | None:

@@ -101,7 +101,9 @@ def _power_of(rest: Rest, at: NDArray[np.bool_], sample: Sample) -> Callable[[Su
     free = [(group, weight), (shown, weight * level)]
     for further in range(1, at.shape[1]):
         other = (channel + further) % at.shape[1]
-        free.append((at.shape[1] * channel + other, weight * rest.rho[at] * rest.plain[pixel, other, shown]))
+        # Cameras clip what is less than black: a channel that is black sees another one differently.
+        pair = 2 * (channel * at.shape[1] + other) + (rest.plain[at] > 0)
+        free.append((pair, weight * rest.rho[at] * rest.plain[pixel, other, shown]))
     clusters = [sample.chosen[0][pixel], shown]
 
     def power(near: Surroundings) -> Power:
