@@ -23,7 +23,7 @@ _EXPOSED = 2.9, 0.5  # of `EXPOSURE_LEFT` at the low and the high end
 _IN_COLOUR = (
     1.0,
     0.5,
-)  # of what is not explained, if the colours of patterns lost detail, at the low and the high end
+)  # of what is not explained, if patterns in colour lost detail, at the low and the high end
 _FIXED_GRIDS = (0.45, 1.2), (0.00045, 0.35)  # a and b at the low and the high end
 
 
@@ -62,11 +62,12 @@ def expected(
     The squared error is modelled as ``k s^2 / m + c rho^2 / m^1.2``. The first term is noise of standard deviation s in
     about k parameters of T, S and rho. The second is what m patterns leave undetermined, in proportion to the contrast
     rho. What no T explains of the patterns is not explained of a backdrop either, and is added, as is the detail of
-    colours that frames have lost (`workflows.ingest.report.colour_detail`): half of it at the high end if it is the
-    patterns' own, which T averages, most where it is wide. If random patterns have
-    offsets, m counts all patterns but the random ones without. Otherwise it counts all, and ``a rho^2 / n^b`` is added
-    for n blocks along the monitor's shorter side in the finest grid: it is not known where in a block the light comes
-    from, which costs clear glass most and frosted glass least.
+    colours that frames have lost (`workflows.ingest.report.colour_detail`). If it is the patterns' own colours that
+    lost it, the high end has half of this: where T is wide, it averages most of it.
+
+    If random patterns have offsets, m counts all patterns but the random ones without. Otherwise it counts all, and
+    ``a rho^2 / n^b`` is added for n blocks along the monitor's shorter side in the finest grid: it is not known where
+    in a block the light comes from, which costs clear glass most and frosted glass least.
 
     If the exposure was not locked, what follows it is not exact: half of the share `EXPOSURE_LEFT` of the standard
     deviation of the exposures is added at the high end, as a share of the light of a backdrop. At the low end it is

@@ -22,8 +22,8 @@ MOST_HELD_OUT = 10
 PIXELS = 320
 """Pixels, at most, that are recovered without them."""
 COLOURED = 0.7
-"""How much narrower those of JPEG and HEIC stills with patterns in colour are: these are stored at half the resolution,
-by which what was held out is farther from the truth than T, which is found from many."""
+"""How much narrower the intervals of JPEG and HEIC stills are if the patterns are in colour: these are stored at half
+the resolution, so that what is held out is farther from the truth than T, which is found from many of them."""
 SHARPENED = 1.35
 """How much wider a film's intervals are: cameras sharpen films by an amount that can't be measured, since patterns are
 sharpened as the glass is."""
