@@ -21,6 +21,7 @@ BATCH = 128
 _PLATEAUS = 2  # for each pattern, at most
 # Light of each code. The curve only has to be close enough to any camera's to compare the cells of a pair.
 _LIGHT = ((np.arange(256) / 255) ** 2.2).astype(np.float32)
+_ALIKE = 0.98  # least correlation of two plateaus that show the same, by another exposure
 _ALTERNATES = 0.6  # least `_alternation` of the sides
 _CONTRAST = 0.15  # least contrast of a pixel of the sides, as a share of the frame's largest
 _WITHIN = (0.3, 0.5, 0.7)  # where a cell is sampled, along each axis
@@ -55,7 +56,8 @@ def find_by_numbers(
 
     Notes
     -----
-    The cells of the sides alternate from each pattern to the next: pixels that do so form two columns, whose ends are
+    An exposure that settles while a pattern is shown divides its plateau: of those that look alike, one is taken. The
+    cells of the sides alternate from each pattern to the next: pixels that do so form two columns, whose ends are
     four points of the display. Starting from these, the simplex method of Nelder and Mead (1965) searches for the
     homography (Hartley and Zisserman, 2004, ch. 4) with the largest differences within all pairs of cells. Numbers must
     ascend in time; what is not in the longest ascending sequence is a misreading.
@@ -71,6 +73,9 @@ def find_by_numbers(
     if whole.size < MIN_PLATEAUS:
         return None
     codes = np.stack([np.median(large.grey[chosen[n]], axis=0).astype(np.uint8) for n in there])
+    whole = whole[_differ(_LIGHT[codes[whole]])]
+    if whole.size < MIN_PLATEAUS:
+        return None
     middle = max((whole.size - BATCH) // 2, 0)
     some = codes[whole[middle : middle + BATCH]]
     for quarters in range(4):
@@ -87,6 +92,15 @@ def find_by_numbers(
         if len(row) >= max(MIN_PLATEAUS, _IN_ORDER * np.count_nonzero(numbers > LEAD)):
             return _found(recording, {int(there[at]): int(numbers[at]) for at in row}, patterns)
     return None
+
+
+def _differ(light: Floats) -> NDArray[np.intp]:
+    """The plateaus that differ from the one before, by more than a factor."""
+    flat = light.reshape(len(light), -1)
+    flat = flat - flat.mean(axis=1, keepdims=True)
+    size = np.maximum(np.linalg.norm(flat, axis=1), 1e-6)
+    alike = np.einsum("ij,ij->i", flat[1:], flat[:-1]) / (size[1:] * size[:-1])
+    return np.flatnonzero(np.concatenate([[True], alike < _ALIKE]))
 
 
 def _among(large: LargeFrames, frames: range) -> NDArray[np.intp]:

@@ -187,3 +187,24 @@ def test_noise_has_no_numbers() -> None:
     assert len(recording.events) == 39
     grey = np.repeat(random.integers(0, 256, (40, 96, 128), np.uint8), 6, axis=0)
     assert find_by_numbers(recording, LargeFrames(grey, np.arange(240)), BORDER, 32) is None
+
+
+def test_numbers_are_read_where_the_exposure_settles_while_patterns_are_shown() -> None:
+    random = np.random.default_rng(0)
+    _, _, width, height = BORDER.inner
+    view, patterns, frames = through(ASKEW), 20, []
+    for number in range(patterns):
+        blocks = random.integers(0, 2, (6, 8, 1), np.uint8).repeat(height // 6, 0).repeat(width // 8, 1)
+        picture = np.full((height, width, 1), 128, np.uint8)
+        picture[: blocks.shape[0], : blocks.shape[1]] = 255 * blocks
+        light = view(draw_border(picture, number, BORDER).astype(np.float32) / 255)[..., 0]
+        for exposure in (1.0, 0.7) if number % 2 else (0.7, 1.0):
+            seen = 230 * exposure * light.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(1, 3))
+            frames += [seen + 0.2 * random.standard_normal(seen.shape) for _ in range(6)]
+    grey = np.clip(np.rint(frames), 0, 255).astype(np.uint8)
+    small = grey.reshape(len(grey), 12, 7, 16, 7).mean(axis=(2, 4))
+    signatures = np.repeat(np.rint(small).astype(np.uint8)[..., np.newaxis], 3, axis=3)
+    recording = Recording(signatures, np.arange(len(grey)) / 24, 0.5)
+    found = find_by_numbers(recording, LargeFrames(grey, np.arange(len(grey))), BORDER, patterns)
+    assert found is not None
+    assert [set(shown // 12) for shown in found.frames] == [{number} for number in range(patterns)]
