@@ -34,8 +34,8 @@ SHOULDER = 0.93
 LEAST = 0.01
 """Light below which a value says nothing."""
 LEAST_SPREAD = 100.0
-"""Weighted squares of what the light of a frame's usable values differs by: with less, its exposure has a standard
-error of over 10 %, and is taken for the usual one."""
+"""How much the light of a frame's usable values must differ, as a sum of weighted squares: with less, its exposure has
+a standard error of over 10 %, and is taken for the usual one."""
 TRIFLE = 0.003
 """A standard deviation of the exposures below this is none."""
 
