@@ -114,9 +114,7 @@ def test_stray_light_of_constant_frames_is_what_s_and_rho_are_fitted_to() -> Non
     np.testing.assert_array_equal(strays[1:, :-2], lit[:, program.measured])
     numbers, sent = constants_of({"patterns": patterns, "border": True}, program)
     seen = np.repeat(0.1 + 0.3 * lit[:, numbers, np.newaxis], 3, axis=2) + 0.2 * sent
-    S, rho, *_ = vars(
-        fit_photometry(seen, sent, np.ones(seen.shape, bool), Noise(1e-6, 1e-4), np.ones(len(sent)))
-    ).values()
+    S, rho, *_ = fit_photometry(seen, sent, np.ones(seen.shape, bool), Noise(1e-6, 1e-4), np.ones(len(sent)))
     for channel in range(3):
         np.testing.assert_allclose(S[:, channel], 0.1 + 0.3 * strays[1:, -2], atol=1e-5)
         np.testing.assert_allclose((S + rho)[:, channel], 0.3 + 0.3 * strays[1:, -1], atol=1e-5)
