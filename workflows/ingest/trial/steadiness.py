@@ -135,8 +135,11 @@ def find_steadiness(
         noise_of_patterns=False,
     )
     program = Program.model_validate(stack.attributes["program"])
-    explained = None if sample is None else _explain(stack, program, sample, border)
-    if sample is None or explained is None:
+    if sample is None:
+        return None
+    wide = _beyond_mask(stack, sample)
+    explained = _explain(stack, program, sample, wide, border)
+    if explained is None:
         return None
     monitor, light, (at_first, through, _) = explained
     begin = np.zeros((stack.frames, 3))
@@ -149,7 +152,7 @@ def find_steadiness(
     first, has_black = at_rest, bool(np.isin(black_patterns(program), patterns).any())
     free = is_free(stack.attributes["auto_exposure"])
     if free:
-        begin[shown, 2] = find_white_excess(stack, program, monitor, light)
+        begin[shown, 2] = find_white_excess(stack, program, monitor, light, wide)
         first = try_out(begin) or at_rest
         # Most of what is lit is clipped: the gain of a frame is less exact than its exposure by the border.
         first = first._replace(off=first.off * [1, 1, 0])
@@ -226,13 +229,19 @@ def _believed(before: float, after: float) -> NDArray[np.bool_]:
     return believed
 
 
-def _explain(
-    stack: Stack, program: Program, sample: Sample, border: BorderValues | None
-) -> tuple[Curve, Patterns, Unexplained] | None:
-    """Find what T leaves unexplained, local tone mapping first; None if the sample has too little contrast.
+def _beyond_mask(stack: Stack, sample: Sample) -> Sample:
+    """A sample of all that sees the monitor, given that of what is to be recovered.
 
-    Pixels that see the bare monitor tell tone mapping better than those of glass, whose T explains some of it: a mask
-    does not count.
+    The bare monitor tells what a camera does better than glass, whose T explains some of it.
+    """
+    return sample if stack.mask().all() else take_sample(stack, masked=False) or sample
+
+
+def _explain(
+    stack: Stack, program: Program, sample: Sample, wide: Sample, border: BorderValues | None
+) -> tuple[Curve, Patterns, Unexplained] | None:
+    """Find what T leaves unexplained in a sample, local tone mapping first, by a wide one; None if the former has too
+    little contrast.
 
     Returns
     -------
@@ -240,7 +249,6 @@ def _explain(
         The monitor's curve, and the patterns' light by it, without glare.
     Unexplained
     """
-    wide = sample if stack.mask().all() else take_sample(stack, masked=False) or sample
     at_rest, turn = np.zeros((stack.frames, 3)), 0
     while True:
         monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])

@@ -6,7 +6,7 @@ import numpy as np
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
-from workflows.ingest.trial.trial_recovery import take_sample, try_recovery
+from workflows.ingest.trial.trial_recovery import Sample, try_recovery
 from workflows.ingest.trial.unexplained import MEASURED, find_unexplained
 from workflows.programs.program import Program
 from workflows.recovery.sensing import Patterns
@@ -17,7 +17,9 @@ EXACT = 0.01
 """and how exactly it is found."""
 
 
-def find_white_excess(stack: Stack, program: Program, monitor: Curve, light: Patterns) -> float:
+def find_white_excess(
+    stack: Stack, program: Program, monitor: Curve, light: Patterns, sample: Sample
+) -> float:
     """The logarithm of the factor by which the border overestimates the exposure of white, if that was free.
 
     It is the gain of all patterns, in units of white's.
@@ -29,6 +31,8 @@ def find_white_excess(stack: Stack, program: Program, monitor: Curve, light: Pat
     monitor : Curve
     light : Patterns
         The program's, without glare.
+    sample : Sample
+        Of all that sees the monitor.
 
     Returns
     -------
@@ -48,9 +52,8 @@ def find_white_excess(stack: Stack, program: Program, monitor: Curve, light: Pat
 
     measured = {name: stack.attributes[name] for name in MEASURED}
     state, shown = np.zeros((stack.frames, 3)), np.isin(stack.attributes["patterns"], program.measured)
-    excess, sample = 0.0, take_sample(stack, masked=False)
-    found = None if sample is None else find_unexplained(stack, program, monitor, light, sample, state)
-    if sample is not None and found is not None:
+    excess, found = 0.0, find_unexplained(stack, program, monitor, light, sample, state)
+    if found is not None:
         try_out = partial(try_recovery, stack, program, monitor, found.patterns, sample)
 
         def left(gain: float) -> float:

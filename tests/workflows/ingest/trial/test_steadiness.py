@@ -308,7 +308,8 @@ def test_border_tells_tone_mapping_if_the_exposure_was_locked(
     monkeypatch.setattr(steadiness, "find_unexplained", lambda *given: SimpleNamespace(rest=None))
     monkeypatch.setattr(steadiness, "find_tone_mapping", lambda *given: taken.append(given[-1]))
     known = values if border else None
-    steadiness._explain(measured(exposed), preset("sketch", 320, 240), cast(Any, None), known)
+    sample = cast(Any, None)
+    steadiness._explain(measured(exposed), preset("sketch", 320, 240), sample, sample, known)
     assert taken == ["light of the border" if asked else None]
 
 
@@ -328,7 +329,9 @@ def test_tone_mapping_is_told_by_pixels_around_the_mask_and_the_rest_by_those_in
     monkeypatch.setattr(steadiness, "take_sample", lambda stack, masked: "masked" if masked else "all")
     monkeypatch.setattr(steadiness, "find_unexplained", find_unexplained)
     monkeypatch.setattr(steadiness, "find_tone_mapping", find_tone_mapping)
-    explained = steadiness._explain(stack, preset("sketch", 320, 240), cast(Any, "masked"), None)
+    sample = cast(Any, "masked")
+    wide = steadiness._beyond_mask(stack, sample)
+    explained = steadiness._explain(stack, preset("sketch", 320, 240), sample, wide, None)
     assert explained is not None
     assert explained[2].rest == "rest of masked"
     assert tried == [("all", 0.0), ("masked", 0.0)]  # what the first has measured does not count

@@ -33,7 +33,9 @@ def stack_of(ingest: Ingest, excess: float, light: float = 0.7) -> Stack:
 
 
 def found(stack: Stack) -> float:
-    return float(np.exp(find_white_excess(stack, PROGRAM, "srgb", lay_out(PROGRAM, "srgb", ()))))
+    sample = take_sample(stack, masked=False)
+    assert sample is not None
+    return float(np.exp(find_white_excess(stack, PROGRAM, "srgb", lay_out(PROGRAM, "srgb", ()), sample)))
 
 
 @pytest.mark.parametrize("excess", [0.9, 1.15])
