@@ -10,7 +10,7 @@ services.api.system.minified.minified_file         256    the files of the web a
 services.cluster.connect._loop                     1      the event loop of dask clients, and its thread
 services.cluster.task._objects                     1      a worker's open object store
 services.runtime.tracing._tracer                   1      the tracer, if traces are asked for
-storage.objects.store._loop                        1      the event loop that reads and writes arrays, and its thread
+storage.objects.event_loop._loop                   1      the event loop that reads and writes arrays, and its thread
 storage.objects.zarr_store.array_metadata          1 each the zarr metadata of a dtype
 workflows.composite.quantise._edges                1 each the codes of a transfer and a dtype: 0.4 MB or less
 workflows.composite.strips._empty_strip            8      strips in which nothing is recovered, of a size each: 0.7 MB

@@ -19,7 +19,8 @@ from zarr.storage import MemoryStore
 from storage.errors import Corrupt
 from storage.layout.blocks import block_edge
 from storage.objects.checksums import CODECS
-from storage.objects.store import Objects, gather
+from storage.objects.event_loop import gather
+from storage.objects.store import Objects
 from storage.objects.zarr_store import EVERY_CHUNK
 
 MEASURED = "measured"

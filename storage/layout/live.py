@@ -8,7 +8,8 @@ import numpy as np
 
 from storage.errors import Corrupt
 from storage.layout import mattes
-from storage.objects.store import Objects, gather
+from storage.objects.event_loop import gather
+from storage.objects.store import Objects
 
 
 def read(objects: Objects, matte: str, format: str) -> bytes | None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import io
 import secrets
 import shutil
-import threading
 from contextlib import asynccontextmanager, contextmanager, suppress
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 from urllib.parse import urlsplit
@@ -28,10 +26,11 @@ from storage import disks
 from storage.objects import byte_objects, checksums, zarr_store
 from storage.objects.byte_objects import PART, Writer
 from storage.objects.checksums import SUFFIX
+from storage.objects.event_loop import finish_all, gather
 from storage.objects.retries import REQUESTS, RETRIES, translate_errors
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator, Sequence
+    from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 
     from obstore.store import ClientConfig
 
@@ -40,34 +39,6 @@ TRIES = 20
 """How often a folder is removed that others write into meanwhile, as the live form of a matte that is being viewed."""
 CROSSED = (errno.ENOENT, errno.ENOTEMPTY, errno.EISDIR)
 """Errors of a removal that others have crossed."""
-
-
-def gather(*work: Coroutine[Any, Any, Any]) -> list[Any]:
-    """Run coroutines concurrently from synchronous code, and return their results.
-
-    A bucket takes tens of milliseconds to respond, and zarr about one to switch to its thread and back. All coroutines
-    have ended when this returns, or raises the first error.
-    """
-    return asyncio.run_coroutine_threadsafe(_gather(*work), _loop()).result()
-
-
-async def _gather(*work: Coroutine[Any, Any, Any]) -> list[Any]:
-    ended = await asyncio.gather(*work, return_exceptions=True)
-    for result in ended:
-        if isinstance(result, BaseException):
-            raise result
-    return ended
-
-
-@cache
-def _loop() -> asyncio.AbstractEventLoop:
-    """The event loop of `gather`, in its own thread, because a caller's loop must not be blocked.
-
-    It is kept because zarr's compression threads belong to the loop.
-    """
-    loop = asyncio.new_event_loop()
-    threading.Thread(target=loop.run_forever, name="objects", daemon=True).start()
-    return loop
 
 
 class Objects:
@@ -152,7 +123,7 @@ class Objects:
         array = array.with_config(zarr_store.EVERY_CHUNK)
         # An empty array has no chunk.
         chunk = array.setitem(slice(None), values) if n else self.zarr.delete(f"{path}/c/0")
-        await _gather(self._put_metadata(path, array), chunk)
+        await finish_all(self._put_metadata(path, array), chunk)
 
     async def _put_metadata(self, path: str, node: zarr.AsyncGroup | zarr.AsyncArray[Any]) -> None:
         for name, document in node.metadata.to_buffer_dict(default_buffer_prototype()).items():

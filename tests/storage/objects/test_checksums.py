@@ -15,7 +15,8 @@ from storage.layout.captures import Stack
 from storage.layout.matte_archive import Archive
 from storage.layout.mattes import Matte
 from storage.objects.checksums import BLOCK, CODECS, Table, crc32c, is_intact, seal, unseal
-from storage.objects.store import Objects, gather
+from storage.objects.event_loop import gather
+from storage.objects.store import Objects
 from tests.storage.installation import ARCHIVE, flip, stream
 
 READS: dict[str, tuple[str, Callable[[Objects], Any]]] = {

@@ -16,7 +16,8 @@ import zarr
 from storage.errors import NoRoom, Unavailable
 from storage.objects import store as module
 from storage.objects.byte_objects import PART
-from storage.objects.store import Objects, gather
+from storage.objects.event_loop import gather
+from storage.objects.store import Objects
 from tests.parts.waiting import until
 from tests.storage.conftest import DISK
 from tests.storage.installation import stream

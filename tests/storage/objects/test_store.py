@@ -20,7 +20,8 @@ from zarr.storage import MemoryStore
 from storage.errors import Corrupt
 from storage.objects.byte_objects import PART
 from storage.objects.checksums import CODECS
-from storage.objects.store import Objects, gather
+from storage.objects.event_loop import gather
+from storage.objects.store import Objects
 from storage.objects.zarr_store import EVERY_CHUNK
 from tests.storage.installation import stream
 
@@ -149,35 +150,6 @@ def test_replaced_array_is_opened_as_new(objects: Objects) -> None:
     objects.delete("a")
     with pytest.raises(FileNotFoundError):
         gather(objects.array("a"))
-
-
-def test_gather_waits_for_all_before_raising() -> None:
-    ended = []
-
-    async def work(seconds: float, error: Exception | None = None) -> float:
-        await asyncio.sleep(seconds)
-        ended.append(seconds)
-        if error:
-            raise error
-        return seconds
-
-    assert gather(work(0.02), work(0.0), work(0.01)) == [0.02, 0.0, 0.01]
-    assert ended == [0.0, 0.01, 0.02]
-    with pytest.raises(KeyError):
-        gather(work(0.03), work(0.02, KeyError()), work(0.01, ValueError()))
-    assert ended[3:] == [0.01, 0.02, 0.03]
-
-
-def test_gather_from_threads_and_running_loop() -> None:
-    async def double(n: int) -> int:
-        return 2 * n
-
-    async def inside() -> list[int]:
-        return gather(double(1), double(2))
-
-    assert asyncio.run(inside()) == [2, 4]
-    with ThreadPoolExecutor(4) as threads:
-        assert list(threads.map(lambda n: gather(double(n)), range(50))) == [[2 * n] for n in range(50)]
 
 
 def test_missing_chunk_is_an_error(objects: Objects, folder: Path) -> None:

@@ -20,7 +20,8 @@ from storage.errors import CaptureError, ClipError, Corrupt
 from storage.layout import composites
 from storage.layout.mattes import Matte
 from storage.objects.byte_objects import PART
-from storage.objects.store import Objects, gather
+from storage.objects.event_loop import gather
+from storage.objects.store import Objects
 from workflows.composite import composite
 from workflows.composite.backdrops.around import expose, over_frame, put_around
 from workflows.composite.backdrops.backdrop import Backdrop
