@@ -120,7 +120,7 @@ def pack(program: Path, source: Path, output: Path, as_json: bool) -> None:
         shown = fit_to_screen(load_program(str(program)), None, bordered=False)
         stills = stills_in(source, shown)
         if len(stills) < shown.count:
-            raise click.UsageError(f"{source} has {len(stills)} files, the program {shown.count} patterns")
+            raise _miscounted(source, len(stills), shown)
         record, files = stills_record(shown, stills)
     else:
         record, files = film_record(program, source)
@@ -138,8 +138,14 @@ def stills_in(folder: Path, program: "Program") -> Sequence[Path]:
             f"{folder} has files of the kinds {', '.join(kinds)}: leave stills of one kind"
         )
     if len(stills) > program.count:
-        raise click.UsageError(f"{folder} has {len(stills)} files, the program {program.count} patterns")
+        raise _miscounted(folder, len(stills), program)
     return stills
+
+
+def _miscounted(folder: Path, files: int, program: "Program") -> click.UsageError:
+    return click.UsageError(
+        f"{folder} has {files} files, the program {program.count} patterns: there must be one still of each"
+    )
 
 
 def stills_record(program: "Program", stills: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Path]]:

@@ -20,10 +20,7 @@ BACKDROP = 1 / 3
 _NOISE = (19.0, 0.040), (5.5, 0.0044)  # k and c at the low and the high end
 _OTHER = 3.0, -5.0  # dB by which composites are worse than patterns at the low end, and at the high end
 _EXPOSED = 2.9, 0.5  # of `EXPOSURE_LEFT` at the low and the high end
-_IN_COLOUR = (
-    1.0,
-    0.5,
-)  # of what is not explained, if patterns in colour lost detail, at the low and the high end
+_IN_COLOUR = 1.0, 0.5  # of what is not explained, if patterns in colour lost detail, likewise
 _FIXED_GRIDS = (0.45, 1.2), (0.00045, 0.35)  # a and b at the low and the high end
 
 
