@@ -36,6 +36,9 @@ LEAST = 0.01
 LEAST_SPREAD = 100.0
 """How much the light of a frame's usable values must differ, as a sum of weighted squares: with less, its exposure has
 a standard error of over 10 %, and is taken for the usual one."""
+LEAST_SWING = 0.03
+"""The standard deviation that they must have, as a share of that of the border's light. Of a recording of the screen
+itself, in which black and white clip, some codes beside black are left."""
 TRIFLE = 0.003
 """A standard deviation of the exposures below this is none."""
 
@@ -188,13 +191,13 @@ def _lines(predicted: Doubles, light: Doubles, weight: Doubles, veiled: bool) ->
     unless they are ``veiled``.
     """
     x = y = np.zeros((len(light), 1))
+    total = np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     if veiled:
-        total = np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
         x, y = ((weight * v).sum(axis=1, keepdims=True) / total for v in (predicted, light))
     off = predicted - x
     spread = (weight * off**2).sum(axis=1, keepdims=True)
     slope = (weight * off * (light - y)).sum(axis=1, keepdims=True) / np.maximum(spread, 1e-12)
-    known = spread >= LEAST_SPREAD
+    known = spread >= np.maximum(LEAST_SPREAD, (LEAST_SWING * predicted.std()) ** 2 * total)
     exposure = np.where(known, slope, 1)
     exposure = np.maximum(exposure / np.median(exposure), 1e-3)
     return exposure, np.where(veiled & known, y / exposure - x, 0)

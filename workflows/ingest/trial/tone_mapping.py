@@ -21,6 +21,8 @@ SURE = 5.0
 """A power is real from so many standard errors on,"""
 LEAST = 0.02
 """and a smaller one is left out: it changes light by less than 3 %."""
+MOST = 1.0
+"""A larger one is something else: with this one, a place would be as bright whatever the light around it."""
 MIDDLE = 0.125**DISPLAY
 """Brightness of surroundings that have a gain of 1: those for which light meters expose (ISO 2720, K = 12.5)."""
 REWEIGHTED, SWEEPS = 5, 8
@@ -36,7 +38,8 @@ def find_tone_mapping(
     known: dict[str, float] | None,
     border: BorderLight | None = None,
 ) -> dict[str, float] | None:
-    """The local tone mapping that a sample of the pixels, or a border, shows; None if it is not certain, or a trifle.
+    """The local tone mapping that a sample of the pixels, or a border, shows; None if it is not certain, a trifle, or
+    more than any.
 
     Parameters
     ----------
@@ -82,6 +85,8 @@ def find_tone_mapping(
         for way in ways
     ]
     (power, error, _), width, near = min(by_way, key=lambda one: one[0].error)
+    if power + (known["power"] if known else 0.0) > MOST:
+        return None
     if known:
         return known | {"power": max(known["power"] + power, 0.0)}
     if power < max(SURE * error, LEAST):

@@ -138,6 +138,14 @@ def test_smaller_error_decides_between_sample_and_border(
     assert found["power"] == pytest.approx(power, rel=0.05)
 
 
+@pytest.mark.parametrize("known", [None, {"power": 0.1, "width": 1 / 10, "usual": -0.5, "spread": 0.2}])
+def test_more_than_any_tone_mapping_is_none(
+    known: dict[str, float] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tone_mapping, "border_power", lambda border, near: Power(400.0, 1e-9, 30.0))
+    assert find_tone_mapping(*left_by(0.1), known, cast(BorderLight, "border")) is None
+
+
 def test_border_tells_alone_where_too_few_pixels_do(monkeypatch: pytest.MonkeyPatch) -> None:
     stack, rest, sample = left_by(0.1)
     rest.flat[:] = False
