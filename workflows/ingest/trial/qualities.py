@@ -1,9 +1,12 @@
 """What a recovery of each quality takes, and how far it will be from the truth, by trials on some pixels."""
 
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numba.core.event import install_recorder
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
@@ -60,9 +63,8 @@ def try_qualities(stack: Stack, sample: Sample, patterns: Patterns) -> dict[str,
     -----
     The time of a pixel depends on its glass: more lobes take longer, and fits start from those of neighbours. So some
     of the squares of `take_sample`, which are spread over the frame, are tried, with the shifts and gains that were
-    found. Kernels are compiled by then: steadiness was measured with them. What counts is the time of this thread on
-    its core: a trial takes half a second, in which other processes often have half of the core. Reading the frames and
-    writing the matte are left out.
+    found. What counts is the time of this thread on its core: a trial takes half a second, in which other processes
+    often have half of the core. Reading the frames and writing the matte are left out.
     """
     attributes = stack.attributes
     program = Program.model_validate(attributes["program"])
@@ -87,10 +89,12 @@ def try_qualities(stack: Stack, sample: Sample, patterns: Patterns) -> dict[str,
     seconds: dict[str, float] = {}
     without: dict[str, RecoveredSample] = {}
     for name, options in QUALITIES.items():
-        start = time.thread_time()
-        if recover_seen(stack, program, monitor, patterns, seen, gains, options, places) is None:
+        taken = _seconds(
+            partial(recover_seen, stack, program, monitor, patterns, seen, gains, options, places)
+        )
+        if taken is None:
             return None
-        seconds[name] = round(share * (time.thread_time() - start), 2)
+        seconds[name] = round(share * taken, 2)
         if can_tell:
             found = recover_seen(stack, program, monitor, patterns, spread, gains, options, held_out=held_out)
             without |= {name: found} if found else {}
@@ -100,6 +104,17 @@ def try_qualities(stack: Stack, sample: Sample, patterns: Patterns) -> dict[str,
         for (name, found), prediction in zip(without.items(), predictions, strict=True)
     }
     return {name: Quality(taken, intervals.get(name)) for name, taken in seconds.items()}
+
+
+def _seconds(recover: Callable[[], RecoveredSample | None]) -> float | None:
+    """The time that a recovery takes this thread, without that of compiling kernels; None if it has no result."""
+    with install_recorder("numba:compile") as compiled:
+        start = time.thread_time()
+        result = recover()
+        taken = time.thread_time() - start
+    if result is None:
+        return None
+    return _seconds(recover) if compiled.buffer else taken
 
 
 def _interval(

@@ -6,6 +6,7 @@ from itertools import count
 
 import numpy as np
 import pytest
+from numba import njit
 
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
@@ -50,6 +51,13 @@ def test_seconds_of_a_trial_count_for_all_pixels(
         "fine": round(share, 2),
         "fast": round(share, 2),
     }
+
+
+def test_compiling_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter((0.0, 60.0, 100.0, 100.5))
+    monkeypatch.setattr(qualities.time, "thread_time", lambda: next(clock))
+    kernel = njit(lambda: 1)
+    assert qualities._seconds(kernel) == 0.5  # the second time
 
 
 def test_frame_too_small_for_a_trial_has_none(ingest: Callable[..., Stack]) -> None:
