@@ -150,7 +150,8 @@ def test_backdrop_moves_by_mouse_and_keys(tab: Page, service: Service, ready: tu
     for kind, magic in (("PNG", b"\x89PNG"), ("EXR", b"v/1\x01")):
         with tab.expect_download() as download:
             tab.get_by_role("button", name=kind, exact=True).click()
-        assert download.value.suggested_filename == f"composite.{kind.lower()}"
+        name = service.client.matte(ready[1])["name"]
+        assert download.value.suggested_filename == f"{name.replace(' ', '_')}.{kind.lower()}"
         assert download.value.path().read_bytes().startswith(magic)
 
 

@@ -331,5 +331,6 @@ def test_composite_is_downloaded(
     page = opened(context, service, ball)
     with page.expect_download() as download:
         page.get_by_role("button", name=kind, exact=True).click()
-    assert download.value.suggested_filename == f"composite.{kind.lower()}"
+    name = service.client.matte(ball)["name"]
+    assert download.value.suggested_filename == f"{name.replace(' ', '_')}.{kind.lower()}"
     assert download.value.path().read_bytes().startswith(magic)

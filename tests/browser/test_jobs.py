@@ -52,6 +52,7 @@ def test_job_is_cancelled_and_deleted(desk: Page, service: Service, ready: tuple
     desk.get_by_role("button", name="Delete", exact=True).click()
     desk.get_by_role("button", name="Cancel").click()
     expect(desk.get_by_role("heading", name="Recovery of a matte")).to_be_visible()
+    expect(desk.get_by_role("button", name="Delete", exact=True)).to_be_focused()
     desk.get_by_role("button", name="Delete", exact=True).click()
     desk.get_by_role("button", name="Delete job").click()
     expect(desk).to_have_url(re.compile("#/jobs$"))
@@ -152,7 +153,7 @@ def test_restarted_service_with_keys(
         for key in ("wrong", "secret"):
             page.get_by_label("Key of the service").fill(key)
             page.keyboard.press("Enter")
-        expect(page.get_by_text("paused").first).to_be_visible()
+        expect(page.locator(".stage .badge")).to_have_text("paused")
         locked.kill()
         expect(page.get_by_text("The service does not answer")).to_be_visible(timeout=MINUTE)
     with serving(folder, *settings, ENVMATTE_KEYS="secret") as again:

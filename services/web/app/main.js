@@ -1,5 +1,5 @@
 // Shows the view that the part of the URL after `#` names, so that a reload and the back button keep it.
-import { h, problemBox } from "./lib/dom.js";
+import { h, pause, problemBox } from "./lib/dom.js";
 import { refreshActivity } from "./lib/activity.js";
 import { recordings } from "./lib/recordings.js";
 import { home } from "./home/home.js";
@@ -12,6 +12,7 @@ import { languageSwitch, loadWords } from "./lib/language.js";
 import { t } from "./lib/words.js";
 import { offerFilms } from "./upload/upload.js";
 
+const RETRY = 5000; // ms
 const VIEWS = { home: [home], film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
 const main = document.getElementById("main");
 const note = document.getElementById("recording");
@@ -57,9 +58,10 @@ async function route(navigated) {
 		if (view === before) view.resume();
 		else view.resume = await VIEWS[name][id ? 1 : 0](view.element, view.signal, id);
 	} catch (error) {
-		const final = error.status >= 400 && error.status < 500;
+		const final = error.status >= 400 && error.status < 500 && error.status !== 401;
 		const again = !final && h("p", h("button", { type: "button", onclick: () => route(true) }, t("again")));
 		if (!view.signal.aborted) view.element.append(problemBox(error), again || "");
+		if (error.status === 0) pause(RETRY, view.signal).then(() => route(false), () => {}); // the service was away
 	}
 	if (view !== shown) return;
 	main.ariaBusy = "false";

@@ -11,7 +11,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.browser.pages import BY_HAND, MINUTE, PHONE, is_fitting, opened
 from tests.browser.test_compositing import WITHOUT
@@ -113,6 +113,40 @@ def test_camera_is_a_backdrop(desk: Page, service: Service) -> None:
     until(lambda: not np.array_equal(drawn(desk), one))
     two = drawn(desk)
     until(lambda: not np.array_equal(drawn(desk), two))
+
+
+@pytest.mark.slow
+def test_own_picture_is_a_backdrop(desk: Page, service: Service, tmp_path: Path) -> None:
+    Image.new("RGB", (64, 48), (0, 255, 0)).save(tmp_path / "green.png")
+    (tmp_path / "empty.png").write_bytes(b"")
+    desk.emulate_media(reduced_motion="reduce")
+    desk.goto(service.url)
+    before = settled(desk)
+    own = desk.get_by_label("Your own picture")
+    own.set_input_files(tmp_path / "empty.png")
+    expect(desk.get_by_text("This browser cannot show the picture")).to_be_visible()
+    expect(desk.get_by_role("radio", name="Dusk")).to_be_checked()
+    own.set_input_files(tmp_path / "green.png")
+    green = settled(desk, since=before)[before[..., 3] > 0].mean(axis=0)
+    assert green[1] > 2 * max(green[0], green[2])
+    expect(desk.get_by_role("radio", name="Dusk")).not_to_be_checked()
+    desk.get_by_role("radio", name="Dusk").check(force=True)
+    until(lambda: np.array_equal(drawn(desk), before))
+
+
+@pytest.mark.slow
+def test_picture_stands_in_while_the_glass_is_loading(desk: Page, service: Service) -> None:
+    held: list[Route] = []
+    desk.route(re.compile(r"\.live$"), lambda route: held.append(route))
+    desk.goto(service.url)
+    still = desk.get_by_alt_text(f"{NAMES[0]} before a checkerboard")
+    expect(still).to_be_visible()
+    expect(desk.get_by_text("Loading", exact=True)).to_be_visible()
+    for route in held:
+        route.continue_()
+    expect(still).to_be_hidden()
+    expect(desk.get_by_text("Loading", exact=True)).to_be_hidden()
+    assert settled(desk).any()
 
 
 @pytest.mark.slow

@@ -76,7 +76,7 @@ def test_every_view_speaks_german(browser: Browser, service: Service, ready: tup
                 expect(page.get_by_role("alert")).to_contain_text("gelöscht")
             check(page, path)
         page.goto(f"{service.url}/#/mattes/{matte}")
-        expect(page.get_by_text(re.compile("^Schachbrett: exakt, 96 × 72 Pixel"))).to_be_visible()
+        expect(page.get_by_text(re.compile("^Karos: exakt, 96 × 72 Pixel"))).to_be_visible()
         unfold(page)
         page.get_by_role("button", name="Pixel erklären").click()
         expect(page.get_by_text(re.compile(r"^Pixel \(48, 36\): .*\d %"))).to_be_visible()

@@ -145,6 +145,7 @@ def test_capture_or_matte_is_renamed_in_place(
         desk.keyboard.type(name)
         desk.keyboard.press("Enter")
         expect(title).to_have_text(name)
+        expect(desk).to_have_title(f"{name} · envmatte")
         assert service.http.get(f"/v1/{path}").json()["name"] == name
     desk.reload()
     expect(title).to_have_text("a ball")

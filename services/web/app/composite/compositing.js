@@ -63,7 +63,7 @@ export function compositing(matte, others, signal) {
 		if (!stage.around) state.set("around", "nothing");
 		history.replaceState(history.state, "", `${view}${state.size ? `?${state}` : ""}`);
 	});
-	const taken = downloads(stage, signal);
+	const taken = downloads(stage, matte, signal);
 	const choices = backdropChoices(matte, stage.element, use, taken.all, first, signal);
 	use(builtIn(first, matte.monitor), choices[0].querySelector(":checked"));
 
@@ -72,13 +72,15 @@ export function compositing(matte, others, signal) {
 		sheet.open = !is;
 		full.hidden = Boolean(is);
 		leave.hidden = !is;
+		(is ? leave : full).focus({ preventScroll: true }); // the one that had the focus is hidden
 	};
 	// Browsers of phones let only videos fill the screen: there it is the window.
 	const full = h("button", { type: "button", onclick: () => (section.requestFullscreen ? section.requestFullscreen() : filled(true)) }, t("full"));
 	const leave = h("button.leave", { type: "button", hidden: true, onclick: () => (document.fullscreenElement ? document.exitFullscreen() : filled(false)) }, t("full.leave"));
+	const keys = h("button", { type: "button", onclick: () => document.getElementById("keys").showModal() }, t("keys"));
 	const folded = (title, ...about) => h("details", h("summary", title), about);
 	const sheet = h("details.panel.sheet", { open: true }, h("summary", t("controls")),
-		h("div.row", full, play, recordButton(stage, matte, signal), explained.button, placed.reset, h("label", transparent, " ", t("transparent")), unmasked),
+		h("div.row", full, play, recordButton(stage, matte, signal), explained.button, placed.reset, keys, h("label", transparent, " ", t("transparent")), unmasked),
 		stage.status, explained.panel, choices,
 		folded(t("placement"), h("p.hint", t("placement.how")), placed.sliders),
 		folded(t("compare"), comparison(stage, matte, others)), folded(t("take"), taken.element), video.element, stage.renderer);

@@ -3,17 +3,18 @@ import { Problem, saveBlob } from "../lib/api.js";
 import { button, h, problemBox } from "../lib/dom.js";
 import { zip } from "../upload/zip.js";
 import { fromFile } from "./backdrops/backdrops.js";
+import { fileName } from "../lib/view.js";
 import { said, t } from "../lib/words.js";
 
 const FORMATS = { PNG: "image/png", JPEG: "image/jpeg", EXR: "image/x-exr" };
 
 // `element`, and `all`, which composites several files.
-export function downloads(stage, signal) {
+export function downloads(stage, matte, signal) {
 	const status = h("p.hint", { role: "status" });
 	const problem = h("div");
 	const larger = h("input", { type: "checkbox" });
 	const buttons = Object.entries(FORMATS).map(([name, type]) =>
-		button(name, stage.problem, async () => saveBlob(await stage.composite(type, { enlarge: larger.checked ? 2 : 1 }), `composite.${name.toLowerCase()}`)));
+		button(name, stage.problem, async () => saveBlob(await stage.composite(type, { enlarge: larger.checked ? 2 : 1 }), fileName(matte, name.toLowerCase()))));
 
 	async function all(files) {
 		const made = [];

@@ -70,6 +70,7 @@ export function explanation(stage, matte, signal) {
 	});
 	// Before the keys that move the backdrop.
 	stage.element.addEventListener("keydown", (event) => {
+		if (pixel && event.key === "Escape") return explain();
 		const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
 		if (!pixel || !by || event.ctrlKey || event.metaKey || event.altKey) return;
 		event.preventDefault();
@@ -77,16 +78,17 @@ export function explanation(stage, matte, signal) {
 		const far = event.shiftKey ? 10 : 1;
 		choose(pixel[0] + far * by[0], pixel[1] + far * by[1]);
 	});
+	function explain(first) {
+		pixel = first;
+		button.ariaPressed = String(Boolean(pixel));
+		panel.hidden = words.hidden = !pixel;
+		inset.hidden = true;
+		drawing.replaceChildren();
+		if (pixel) look();
+	}
 	const button = h("button", {
 		type: "button", "aria-pressed": "false",
-		onclick: () => {
-			pixel = pixel ? undefined : [width >> 1, height >> 1];
-			button.ariaPressed = String(Boolean(pixel));
-			panel.hidden = words.hidden = !pixel;
-			inset.hidden = true;
-			drawing.replaceChildren();
-			if (pixel) look();
-		},
+		onclick: () => explain(pixel ? undefined : [width >> 1, height >> 1]),
 	}, t("pixel.explain"));
 	stage.element.append(inset, drawing, words);
 	const panel = h("div.stack", { hidden: true }, figures, problem);

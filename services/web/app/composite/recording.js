@@ -3,7 +3,7 @@ import { saveBlob } from "../lib/api.js";
 import { h } from "../lib/dom.js";
 import { videoType } from "../lib/recordings.js";
 import { t } from "../lib/words.js";
-import { matteName } from "../lib/view.js";
+import { fileName } from "../lib/view.js";
 
 const RATE = 30; // frames per second, at most
 const BITS = 12e6; // per second
@@ -28,8 +28,7 @@ export function recordButton(stage, matte, signal) {
 		mine.ondataavailable = ({ data }) => parts.push(data);
 		mine.onstop = () => {
 			const [type] = mine.mimeType.split(";");
-			const file = `${matteName(matte).replace(/[^\p{L}\p{N}._-]+/gu, "_")}.${type.endsWith("mp4") ? "mp4" : "webm"}`;
-			if (!signal.aborted) saveBlob(new Blob(parts, { type }), file);
+			if (!signal.aborted) saveBlob(new Blob(parts, { type }), fileName(matte, type.endsWith("mp4") ? "mp4" : "webm"));
 		};
 		draw();
 		mine.start();

@@ -6,6 +6,7 @@ import { t } from "../lib/words.js";
 
 const FREE = 0.9; // share of the frame's shorter side that has to fit into the window
 const SHARPEST = 2; // device pixels per pixel of the page that are drawn around the glass
+const LATE = 400; // ms after which a picture stands in for what is still coming
 const TILE = 640; // pixels of the width of a video's frames around the glass
 
 export class GlassWindow extends LiveGlass {
@@ -34,10 +35,10 @@ export class GlassWindow extends LiveGlass {
 		this.#still.src = still(sample);
 		this.#still.alt = t("home.board", { glass: titleOf(sample) });
 		this.canvas.ariaLabel = t("home.before", { glass: titleOf(sample) });
-		const found = this.gl ? await fetchSample(sample, this.signal) : null;
+		const found = this.gl ? await this.#fetch(sample, () => choice === this.#choices) : null;
 		if (choice !== this.#choices || this.signal.aborted) return;
 		this.#sample = sample;
-		if (this.gl) this.load(found, sample.monitor);
+		if (this.gl && this.load(found, sample.monitor)) this.#still.hidden = true;
 		this.fit(this.#free);
 	}
 
@@ -99,7 +100,21 @@ export class GlassWindow extends LiveGlass {
 		this.#stand(t("home.lost"));
 	}
 
-	#stand(text) {
+	// The live form of a sample. Where it takes long, and nothing is shown yet, its picture is.
+	async #fetch(sample, isWanted) {
+		const late = setTimeout(() => isWanted() && !this.isLive && this.#stand(t("stage.loading"), sample), LATE);
+		try {
+			return await fetchSample(sample, this.signal);
+		} finally {
+			clearTimeout(late);
+			if (isWanted() && this.gl) this.status.textContent = "";
+		}
+	}
+
+	// Shows the picture of a sample, and why.
+	#stand(text, sample = this.#sample) {
+		this.#sample = sample;
+		this.fit(this.#free);
 		this.canvas.hidden = true;
 		this.#still.hidden = false;
 		this.status.textContent = text;

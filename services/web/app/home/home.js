@@ -1,8 +1,8 @@
 // The first view: a sample to play with, before anything is read or filmed.
-import { button, h, problemBox } from "../lib/dom.js";
+import { button, fileField, h, problemBox } from "../lib/dom.js";
 import { fromFile } from "../composite/backdrops/backdrops.js";
 import { scenery } from "../composite/backdrops/scenery.js";
-import { cameraSymbol, choice, thumbs } from "../composite/backdrops/thumb_choices.js";
+import { cameraSymbol, choice, fileSymbol, thumbOf, thumbs } from "../composite/backdrops/thumb_choices.js";
 import { handleGestures, placement } from "../composite/placement.js";
 import { camera } from "../composite/backdrops/video_backdrops.js";
 import { fileInput, onDrop, upload } from "../upload/upload.js";
@@ -35,8 +35,9 @@ export async function home(main, signal) {
 	async function use(promise, control) {
 		problem.replaceChildren();
 		try {
-			await glass.use(promise);
-			used = control;
+			const taken = await glass.use(promise);
+			if (taken) used = control;
+			return taken;
 		} catch (error) {
 			if (used) used.checked = true;
 			fail(error);
@@ -45,14 +46,21 @@ export async function home(main, signal) {
 	const drawn = (name) => Promise.resolve(scenery(name, ...samples[0].monitor));
 	const backdrops = SCENES.map((name, i) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, i === 0, (control) => use(drawn(name), control)));
 	backdrops.push(choice("backdrop", t("home.camera"), cameraSymbol(), false, (control) => use(camera(), control)));
+	// A file is no choice before it is chosen: then a radio button that nobody sees marks it.
+	const isOwn = h("input", { type: "radio", name: "backdrop", hidden: true });
+	const frame = h("span.frame", fileSymbol());
+	backdrops.push(h("label.thumb-choice", fileField({ accept: "image/*", title: "" }, (files) => take(files)), isOwn, frame, h("span", t("page.own"))));
 	const glasses = samples.map((sample, i) =>
 		choice("sample", titleOf(sample), h("img", { src: still(sample), alt: "", width: 96, height: 72, draggable: "false" }), i === 0, () => show(sample)));
 
-	const take = (files) => {
+	async function take(files) {
 		if (files.length > 1 || !files[0].type.startsWith("image/")) return upload(files);
-		for (const control of main.querySelectorAll("[name=backdrop]")) control.checked = false;
-		use(fromFile(files[0]).then((found) => found.picture ? found : Promise.reject(new Error(t("home.unreadable")))));
-	};
+		const opened = fromFile(files[0]).then((found) => found.picture ? found : Promise.reject(new Error(t("home.unreadable"))));
+		const own = await use(opened, isOwn);
+		if (!own) return;
+		isOwn.checked = true;
+		frame.replaceChildren(thumbOf(own));
+	}
 	onDrop(glass.element, take);
 	const remove = button(t("home.remove"), problem, () => {
 		removeSamples();

@@ -34,7 +34,7 @@ export function unlock(problem) {
 		};
 		dialog.onclose = () => {
 			asking = undefined;
-			reject(problem); // has no effect once a key was given
+			reject(new Problem({ ...problem, title: t("unlock.title"), detail: t("unlock.cancelled") })); // has no effect once a key was given
 		};
 		dialog.showModal();
 	});

@@ -37,7 +37,7 @@ export const empty = (title, text) => h("div.empty", h("strong", title), h("p", 
 
 const LEVEL = {
 	good: "good", ready: "good", succeeded: "good",
-	warning: "warning", ingesting: "busy", recovering: "busy", running: "busy", queued: "busy",
+	warning: "warning", paused: "warning", ingesting: "busy", recovering: "busy", running: "busy", queued: "busy",
 	bad: "bad", failed: "bad", cancelled: "off",
 };
 export const badge = (word) => h("span", { class: `badge ${LEVEL[word] ?? "off"}` }, known(`state.${word}`, word));
@@ -138,6 +138,8 @@ export function button(text, where, work, kind = "") {
 				if (error.name !== "AbortError") where.replaceChildren(problemBox(error));
 			} finally {
 				currentTarget.disabled = false;
+				// What is disabled loses the focus, and keys would begin again at the top.
+				if (document.activeElement.matches("body, dialog:not([open]) *")) currentTarget.focus({ preventScroll: true });
 			}
 		},
 	}, text);

@@ -5,6 +5,7 @@ import { badge, duration, facts, h, newest, pause, problemBox } from "./dom.js";
 import { known, locale, said, t } from "./words.js";
 
 const LOG_EVERY = 2000; // ms
+const TICK = 1000; // ms
 
 // Fills `panel` and follows a job to its end; resolves with its last state. `changed` gets every state, the `known` first.
 export async function followJob(panel, id, signal, changed = () => {}, known = null) {
@@ -29,20 +30,26 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 		} catch {} // the next event reads it again
 	});
 
+	const show = (job, since = 0) => about.replaceChildren(facts({
+		[t("job.tiles")]: job.tiles.total ? t("of", { n: job.tiles.done, all: job.tiles.total }) : null,
+		[t("job.lost")]: job.tiles.failed || null,
+		[t("job.workers")]: job.state === "running" ? job.workers : null,
+		[t("job.ran")]: job.run_seconds ? duration(job.run_seconds + since) : null,
+		[t("job.waited")]: job.queued_seconds >= 1 ? duration(job.queued_seconds) : null,
+	}));
+	let tick; // goes on while no event comes
 	const update = (job) => {
 		const active = ACTIVE.includes(job.state);
+		const now = performance.now();
+		clearInterval(tick);
+		if (job.state === "running" && !job.paused) tick = setInterval(() => signal.aborted ? clearInterval(tick) : show(job, (performance.now() - now) / 1000), TICK);
 		bar.value = job.progress;
+		if (job.state === "running" && job.stage === "finishing") bar.removeAttribute("value"); // it has no parts to count
 		bar.hidden = !active && job.state !== "failed";
-		stage.replaceChildren(badge(job.state), ` ${describe(job)}`);
+		stage.replaceChildren(badge(job.paused && active ? "paused" : job.state), ` ${describe(job)}`);
 		waits.hidden = !job.waits_for;
 		waits.textContent = job.waits_for ? t("job.waits", { why: said(job.waits_for) }) : "";
-		about.replaceChildren(facts({
-			[t("job.tiles")]: job.tiles.total ? t("of", { n: job.tiles.done, all: job.tiles.total }) : null,
-			[t("job.lost")]: job.tiles.failed || null,
-			[t("job.workers")]: job.state === "running" ? job.workers : null,
-			[t("job.ran")]: job.run_seconds ? duration(job.run_seconds) : null,
-			[t("job.waited")]: job.queued_seconds >= 1 ? duration(job.queued_seconds) : null,
-		}));
+		show(job);
 		problem.replaceChildren(...(job.problem ? [problemBox(job.problem)] : []));
 		read(!active);
 		changed(job);
@@ -50,7 +57,9 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 	if (known) update(known);
 	const lost = (away) => {
 		panel.classList.toggle("lost", away);
-		if (away) stage.textContent = t("job.away");
+		if (!away) return;
+		clearInterval(tick);
+		stage.textContent = t("job.away");
 	};
 	return follow(`v1/jobs/${id}/events`, signal, update, { lost, over: (job) => !ACTIVE.includes(job.state) });
 }

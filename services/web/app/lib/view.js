@@ -26,6 +26,9 @@ export const qualityOf = ({ options: { quality } }) => QUALITIES.includes(qualit
 
 export const matteName = ({ id, name }) => name || t("matte.unnamed", { id: id.slice(0, 8) });
 
+// The name of a file of a matte.
+export const fileName = (matte, kind) => `${matteName(matte).replace(/[^\p{L}\p{N}._-]+/gu, "_")}.${kind}`;
+
 const thumbs = new Map(); // by id: what is ready never changes
 
 // A function that makes thumbnails. Pictures are requested one after the other, and only of what is in view.

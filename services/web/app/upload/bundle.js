@@ -34,7 +34,8 @@ export async function filmArchive(film, record, signal) {
 // Stills as one thing to upload: one of each pattern, in the order of their names.
 export function together(files) {
 	const stills = [...files].sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
-	return { name: t("stills.name", { first: stills[0].name, n: stills.length }), type: "", stills, lastModified: stills[0].lastModified };
+	const [{ name: first }] = stills;
+	return { name: stills.length > 1 ? t("stills.name", { first, n: stills.length }) : first, type: "", stills, lastModified: stills[0].lastModified };
 }
 
 export async function stillsArchive({ stills }, { video, mask, ...record }, signal) {

@@ -46,8 +46,9 @@ export function sharing(id, signal) {
 function field(label, text, problem) {
 	const input = h("input", { type: "text", readonly: true, value: text, onfocus: () => input.select() });
 	const copy = button(t("share.copy"), problem, async () => {
-		await navigator.clipboard?.writeText(text);
 		input.select(); // for browsers that let no page of http write into the clipboard
+		await navigator.clipboard?.writeText(text);
+		if (navigator.clipboard) copy.textContent = t("share.copied");
 	});
 	return h("div.row.copied", h("label", label, input), copy);
 }
