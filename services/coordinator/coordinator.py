@@ -278,10 +278,12 @@ class Coordinator:
         under_way = self._dispatcher.under_way(run.job)
         with self._writing() as c:
             following = run.write(c, self._settings.attempts, self._dispatcher.threads, under_way)
+            # Not later, since a job that has ended may be deleted.
+            row = jobs.get(c, run.job) if following.ended else None
         run.advance(following)
-        if following.ended:
+        if row is not None:
             self._drop(run.job)
-            self._tidy(run.job)
+            self._tidy(row)
 
     def _drop(self, job: str) -> None:
         """Stop running a job, and cancel its tasks on the cluster."""
@@ -293,16 +295,15 @@ class Coordinator:
         with self._writing() as c:
             row = jobs.get(c, job)
             write_failure(c, JOB_KINDS[row.kind], task_of(row, self._settings.limits), error)
+            row = jobs.get(c, job)  # as it is now
             jobs.change(c, job, leftovers=False)  # of a cancelled job that can't be cleaned up
         if job in self._runs:
             self._drop(job)
-        self._tidy(job)
+        self._tidy(row)
 
-    def _tidy(self, job: str) -> None:
+    def _tidy(self, row: Row[Any]) -> None:
         """Remove what is of no use after the end of a job: its input, or everything if it can't be retried."""
-        self._troubles.pop(job, None)  # they are not those of a retry
-        with reading(self._engine) as c:
-            row = jobs.get(c, job)
+        self._troubles.pop(row.id, None)  # they are not those of a retry
         if row.state == "succeeded":
             self._housekeeping.submit(_logged, JOB_KINDS[row.kind].remove_inputs, self._objects, row)
             self._housekeeping.submit(_logged, count_bytes, self._engine, self._objects)

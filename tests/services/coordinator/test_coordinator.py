@@ -14,9 +14,10 @@ from services.cluster.dispatcher import Outcome
 from services.coordinator import coordinator, job_run
 from services.coordinator.coordinator import POLL, WRITE, Coordinator
 from services.coordinator.job_kinds import JOB_KINDS
+from services.coordinator.job_run import JobRun, Next
 from services.settings import CoordinatorSettings
 from storage.database.engine import reading, writing
-from storage.errors import StoreUnavailable, Unavailable
+from storage.errors import CaptureError, EnvmatteError, StoreUnavailable, Unavailable
 from storage.layout import uploads
 from storage.objects.store import Objects
 from storage.records import captures, jobs, leases, mattes, tiles
@@ -55,18 +56,19 @@ class Idle:
         pass
 
 
-class Away(Idle):
-    """A dispatcher whose worker cannot reach the store."""
+class Failing(Idle):
+    """A dispatcher whose worker fails each tile with an error."""
 
-    def __init__(self) -> None:
+    def __init__(self, error: EnvmatteError) -> None:
         super().__init__()
+        self.error = error
         self.cluster = {"workers": [], "problem": None}
         self.tried: list[tuple[str, int]] = []
 
     def collect(self) -> list[Outcome]:
         tried, self.submitted = self.submitted, []
         self.tried += tried
-        return [Outcome(job, tile, error=StoreUnavailable("it is away")) for job, tile in tried]
+        return [Outcome(job, tile, error=self.error) for job, tile in tried]
 
 
 @pytest.fixture
@@ -255,7 +257,7 @@ def test_job_without_the_store_is_tried_again_and_says_so(
 ) -> None:
     monkeypatch.setattr(job_run, "HOLD", 0.5)
     monkeypatch.setattr(coordinator, "BEAT", 0.1)
-    dispatcher, begin = Away(), time.monotonic()
+    dispatcher, begin = Failing(StoreUnavailable("it is away")), time.monotonic()
     with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
         until(lambda: len(dispatcher.tried) == 4)
         assert time.monotonic() - begin > 3 * job_run.HOLD
@@ -284,6 +286,21 @@ def test_files_that_cannot_be_removed_are_removed_later(
     with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, Idle()):  # type: ignore[arg-type]
         until(lambda: not failures)  # a sweep may have removed them before
         until(lambda: not objects.paths_below("uploads"))
+
+
+def test_files_of_a_failed_job_are_removed_if_it_is_deleted_at_once(
+    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def deleted_meanwhile(run: JobRun, following: Next) -> None:
+        with writing(engine) as c:
+            jobs.delete(c, run.job)
+
+    monkeypatch.setattr(JobRun, "advance", deleted_meanwhile)
+    monkeypatch.setattr(coordinator, "DYING", 0.1)
+    dispatcher = Failing(CaptureError("no frames"))
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+        until(lambda: not objects.paths_below("uploads"), 10)
+    assert dispatcher.tried == [(job, PREPARE)]
 
 
 @pytest.mark.exhaustive
