@@ -296,7 +296,7 @@ class Coordinator:
             row = jobs.get(c, job)
             write_failure(c, JOB_KINDS[row.kind], task_of(row, self._settings.limits), error)
             row = jobs.get(c, job)  # as it is now
-            jobs.change(c, job, leftovers=False)  # of a cancelled job that can't be cleaned up
+            jobs.clear_leftovers(c, job)  # of a cancelled job that can't be cleaned up
         if job in self._runs:
             self._drop(job)
         self._tidy(row)
@@ -314,7 +314,7 @@ class Coordinator:
         """Remove what a cancelled job wrote, once no worker works on it."""
         with self._writing() as c:
             JOB_KINDS[row.kind].cancelled(c, row)
-            jobs.change(c, row.id, leftovers=False)
+            jobs.clear_leftovers(c, row.id)
         dying = DYING if row.started_at else 0
         self._discards.append((time.monotonic() + dying, row))
 

@@ -64,7 +64,7 @@ def delete_old_jobs(engine: Engine, objects: Objects, seconds: float | None) -> 
     with reading(engine) as c:  # other writers need not wait while this scans all rows
         keys = c.scalars(gone).all()
         jobs_over: Sequence[str] = ()
-        over = job.c.finished_at <= time.time() - (seconds or 0)
+        over = (job.c.finished_at <= time.time() - (seconds or 0)) & ~job.c.leftovers
         if seconds is not None:
             jobs_over = c.scalars(select(job.c.id).where(over, ~in_use).limit(MOST)).all()
     if not (keys or jobs_over):

@@ -11,6 +11,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
+from storage.database.owners import NOBODY
 from storage.database.rows import ROW, find, new_id
 from storage.database.tables import captures, jobs, mattes, tiles
 from storage.database.tables import log as lines
@@ -236,6 +237,8 @@ def retry(connection: Connection, job: str, *, replan: bool = False, trace: str 
 def delete(connection: Connection, job: str) -> None:
     """Delete a job that has ended, with its tiles and its log.
 
+    A job with leftovers is deleted by `clear_leftovers`; until then it belongs to nobody, so no caller sees it.
+
     Raises
     ------
     NotFound
@@ -246,7 +249,16 @@ def delete(connection: Connection, job: str) -> None:
     row = get(connection, job)
     if row.state in ACTIVE:
         raise Conflict(f"job {job} is {row.state}; cancel it first")
-    connection.execute(jobs.delete().where(jobs.c.id == job))
+    if row.leftovers:  # its row tells the coordinator what to remove
+        change(connection, job, owner=NOBODY)
+    else:
+        connection.execute(jobs.delete().where(jobs.c.id == job))
+
+
+def clear_leftovers(connection: Connection, job: str) -> None:
+    """Record that nothing is left of a cancelled job, and delete it if that was asked for meanwhile."""
+    change(connection, job, leftovers=False)
+    connection.execute(jobs.delete().where(jobs.c.id == job, jobs.c.owner == NOBODY))
 
 
 def log(connection: Connection, job: str, text: str) -> None:

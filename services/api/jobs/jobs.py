@@ -365,7 +365,5 @@ def delete_job(context: OwnerContext, id: str) -> None:
     with writing(context.engine) as c:
         row = jobs.get(c, id)
         jobs.delete(c, id)
-        if row.leftovers:  # it was cancelled a moment ago
-            JOB_KINDS[row.kind].cancelled(c, row)
     if row.kind == "composite":
         context.objects.delete(composites.path(id))

@@ -115,6 +115,22 @@ def test_cancelled_ingest_leaves_nothing(service: Service, capture: str, capture
     until(lambda: not any(uploaded["id"] in name for name in service.stored() - before))
 
 
+def test_job_deleted_as_soon_as_it_is_cancelled_leaves_nothing(
+    service: Service, capture: str, capture_archive: Path
+) -> None:
+    made = []
+    for _ in range(3):
+        job = service.client.recover(capture)
+        until(lambda job=job: service.client.job(job["id"])["tiles"]["done"])
+        uploaded = service.client.upload(capture_archive)
+        made += [uploaded["id"], job["matte"]]
+        for one in (job["id"], uploaded["job"]):
+            service.http.post(f"/v1/jobs/{one}/cancel")
+            assert service.http.delete(f"/v1/jobs/{one}").status_code == 204
+            assert service.http.get(f"/v1/jobs/{one}").status_code == 404
+    until(lambda: service.stored_ids().isdisjoint(made), 20)
+
+
 @pytest.mark.exhaustive
 @pytest.mark.slow
 def test_ingest_that_failed_for_a_passing_reason_can_be_retried(

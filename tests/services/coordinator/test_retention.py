@@ -88,16 +88,20 @@ def test_data_of_an_active_job_does_not_expire(engine: Engine, kind: str, state:
         assert delete_expired(c) == ["captures/used", "uploads/used", "mattes/used"]
 
 
-def test_leftovers_of_cancelled_jobs_do_not_expire(engine: Engine) -> None:
+def test_leftovers_of_cancelled_jobs_do_not_expire(engine: Engine, objects: Objects) -> None:
     """Until the coordinator has cleaned up, the states of a matte and its capture say that they are unfinished."""
     with writing(engine) as c:
         job = jobs.add(c, "ingest", "c", {})
         captures.add(c, "c", job, name="", bytes=1, frames=1, program={}, seconds=-1)
         other = jobs.add(c, "recover", "c", {}, "m")
         mattes.add(c, "m", "c", other, {}, -1)
-        for one in (job, other):
+        composite = jobs.add(c, "composite", "c", {}, "m")
+        for one in (job, other, composite):
             jobs.cancel(c, one)
         assert delete_expired(c) == []
+    age_jobs(engine)
+    delete_old_jobs(engine, objects, 60)
+    assert listed(engine) == {job, other, composite}
 
 
 def test_large_backlog_expires_in_parts(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:

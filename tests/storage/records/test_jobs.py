@@ -3,11 +3,13 @@
 from itertools import pairwise
 
 import pytest
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, Engine, func, select
 
 from storage import statistics
 from storage.database import tables
-from storage.database.rows import ROW
+from storage.database.engine import writing
+from storage.database.owners import for_owner
+from storage.database.rows import ROW, page
 from storage.errors import Conflict, NotFound
 from storage.records import captures, jobs, mattes, tiles
 from tests.storage.planned import log_of, planned
@@ -120,7 +122,7 @@ def test_deleting_job_deletes_tiles_and_log(connection: Connection) -> None:
     job, other = planned(connection), planned(connection)
     with pytest.raises(Conflict, match="cancel it first"):
         jobs.delete(connection, job)
-    jobs.cancel(connection, job)
+    jobs.end(connection, job, "failed")
     jobs.delete(connection, job)
     with pytest.raises(NotFound):
         jobs.get(connection, job)
@@ -171,6 +173,23 @@ def test_only_cancelled_job_has_leftovers(connection: Connection) -> None:
     jobs.change(connection, job, leftovers=False)
     jobs.cancel(connection, job)  # again
     assert jobs.cancelled_with_leftovers(connection) == []
+
+
+def test_deleted_job_is_kept_from_its_owner_until_its_leftovers_are_removed(engine: Engine) -> None:
+    with writing(for_owner(engine, "alice")) as c:
+        job, kept = planned(c), planned(c)
+        for one in (job, kept):
+            jobs.cancel(c, one)
+        jobs.delete(c, job)
+        assert [row.id for row in page(c, tables.jobs, 10, None)] == [kept]
+        with pytest.raises(NotFound):
+            jobs.delete(c, job)
+    with writing(engine) as c:
+        assert {row.id for row in jobs.cancelled_with_leftovers(c)} == {job, kept}
+        for one in (job, kept):
+            jobs.clear_leftovers(c, one)
+        assert jobs.cancelled_with_leftovers(c) == []
+        assert list(c.scalars(select(tables.jobs.c.id))) == [kept]
 
 
 def test_each_attempt_counts_as_stored(connection: Connection) -> None:
