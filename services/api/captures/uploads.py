@@ -28,9 +28,10 @@ from services.api.http.media_types import require_media_type
 from services.api.http.router import Router
 from services.api.limits.quotas import admit_bytes, admit_upload
 from services.api.limits.reservations import STEP, Reservation
+from services.runtime.problems import Unauthorized
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id
-from storage.errors import Conflict, InvalidInput, NotFound
+from storage.errors import Conflict, InvalidInput, NoRoom, NotFound, TooMany
 from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
 from storage.records import bodies, captures, uploads
@@ -79,7 +80,12 @@ async def create_upload(
         limits.check_pixels(known["width"], known["height"])
     row, new = await context.call(_create, context, length, metadata, idempotency_key)
     if with_body and new:
-        row = await _append(context, request, row, checksum)
+        try:
+            row = await _append(context, request, row, checksum)
+        except (InvalidInput, NoRoom, TooMany, Unauthorized):
+            # A refusal has no Location: nobody could continue the upload, or delete it.
+            await anyio.to_thread.run_sync(delete_upload, context, row.id)
+            raise
     return Response(status_code=201, headers={"Location": f"/v1/uploads/{row.id}"} | _headers(row))
 
 

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import Engine, PoolProxiedConnection, event
+from sqlalchemy import Engine, PoolProxiedConnection, event, func, select
 
 from services.api.app import build_app
 from services.settings import Settings
-from storage.database.engine import open_engine
+from storage.database.engine import open_engine, reading
+from storage.database.tables import uploads
 from storage.objects.store import Objects
 from tests.parts.captures import nested_program
 from tests.parts.postgres import Server
@@ -121,3 +122,28 @@ def test_empty_key_creates_in_any_case(client: TestClient) -> None:
     answers = [client.post("/v1/uploads", headers=headers) for _ in range(2)]
     assert [answer.status_code for answer in answers] == [201, 201]
     assert answers[0].headers["location"] != answers[1].headers["location"]
+
+
+@pytest.mark.parametrize(
+    ("length", "content", "extra", "status"),
+    [
+        (4, b"first", {}, 413),
+        (4, [b"fir", b"st"], {}, 413),
+        (5, b"first", {"Upload-Checksum": "sha1 AAAA"}, 460),
+    ],
+    ids=["announced", "streamed", "checksum"],
+)
+def test_refused_body_of_a_creation_leaves_no_upload(
+    client: TestClient,
+    engine: Engine,
+    objects: Objects,
+    length: int,
+    content: bytes | list[bytes],
+    extra: dict[str, str],
+    status: int,
+) -> None:
+    headers = CHUNK | {"Upload-Length": str(length)} | extra
+    assert client.post("/v1/uploads", headers=headers, content=content).status_code == status
+    with reading(engine) as c:
+        assert c.scalar(select(func.count()).select_from(uploads)) == 0
+    assert objects.names("uploads") == []
