@@ -114,20 +114,21 @@ def _shrink(
     stack: Stack, frames: list[int]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
     """The light of frames at the size of thumbnails, and where it is clipped high and low; read in bands of rows."""
-    factor = _factor(stack)
-    height, width = stack.height // factor, stack.width // factor
+    # Frames may be lower or narrower than one square.
+    down, across = (min(_factor(stack), edge) for edge in (stack.height, stack.width))
+    height, width = stack.height // down, stack.width // across
     # Full scale is shown as white, whatever the camera's curve.
     top = np.iinfo(stack.dtype).max
     look_up = look_up_of(stack)
     light = np.zeros((len(frames), height, width, stack.channels), np.float32)
     high, low = (np.zeros((len(frames), height, width), bool) for _ in range(2))
-    band = max(1, ROWS // factor)
+    band = max(1, ROWS // down)
     for first in range(0, height, band):
         last = min(first + band, height)
-        codes = stack.read_frames(frames, slice(first * factor, last * factor), slice(0, width * factor))
+        codes = stack.read_frames(frames, slice(first * down, last * down), slice(0, width * across))
         for number, of_frame in enumerate(codes):
             checkpoint()
-            cells = of_frame.reshape(last - first, factor, width, factor, stack.channels)
+            cells = of_frame.reshape(last - first, down, width, across, stack.channels)
             light[number, first:last] = light_of_codes(cells, look_up).mean(axis=(1, 3))
             high[number, first:last] = (cells == top).any(axis=(1, 3, 4))
             low[number, first:last] = (cells == 0).any(axis=(1, 3, 4))

@@ -15,6 +15,17 @@ from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
 
 Ingest = Callable[..., Stack]
+RECORD = {
+    "format": "envmatte-capture/1",
+    "program": {
+        "monitor": {"width": 64, "height": 48},
+        "parts": [
+            {"kind": "constant", "levels": [0, 1]},
+            {"kind": "stripes", "axis": "x", "count": 2},
+        ],
+    },
+    "frames": [{"file": f"{n}.png", "pattern": n} for n in range(4)],
+}
 
 
 @pytest.mark.parametrize(
@@ -38,20 +49,21 @@ def test_clipped_pixels_are_marked(ingest: Ingest, width: int, height: int, dept
     assert (pixels == AT_WHITE).all(axis=2).sum() > 20
 
 
+@pytest.mark.parametrize(("width", "height", "size"), [(3000, 1, (230, 1)), (1, 3000, (1, 230))])
+def test_frames_of_one_row_or_column_are_drawn(
+    ingest: Ingest, make_zip: Callable[..., bytes], width: int, height: int, size: tuple[int, int]
+) -> None:
+    files = {f"{n}.png": encode_png(np.full((height, width, 1), 60 * n + 9, np.uint8)) for n in range(4)}
+    stack = ingest("c", make_zip(RECORD, files))
+    with Image.open(io.BytesIO(thumbnail(stack))) as small:
+        assert small.size == size
+    with Image.open(io.BytesIO(contact_sheet(stack))) as sheet:
+        assert sheet.size == (4 * (size[0] + 8) + 8, size[1] + 18 + 16)
+
+
 def test_grey_frames_have_one_too(ingest: Ingest, make_zip: Callable[..., bytes]) -> None:
-    record = {
-        "format": "envmatte-capture/1",
-        "program": {
-            "monitor": {"width": 64, "height": 48},
-            "parts": [
-                {"kind": "constant", "levels": [0, 1]},
-                {"kind": "stripes", "axis": "x", "count": 2},
-            ],
-        },
-        "frames": [{"file": f"{n}.png", "pattern": n} for n in range(4)],
-    }
     files = {f"{n}.png": encode_png(np.full((12, 16, 1), 60 * n + 9, np.uint8)) for n in range(4)}
-    with Image.open(io.BytesIO(contact_sheet(ingest("c", make_zip(record, files))))) as sheet:
+    with Image.open(io.BytesIO(contact_sheet(ingest("c", make_zip(RECORD, files))))) as sheet:
         assert sheet.size == (4 * 24 + 8, 12 + 18 + 16)
-    with Image.open(io.BytesIO(thumbnail(ingest("d", make_zip(record, files))))) as small:
+    with Image.open(io.BytesIO(thumbnail(ingest("d", make_zip(RECORD, files))))) as small:
         assert (small.size, small.getcolors()) == ((16, 12), [(192, (69, 69, 69))])  # the white frame
