@@ -12,15 +12,13 @@ from storage.errors import CaptureError
 from workflows.images.tone_curves import Response
 from workflows.programs.border import Border
 from workflows.programs.program import Program
-from workflows.untrusted.validation import Name, reason
+from workflows.untrusted.validation import Name, field_and_reason
 
 MANIFEST = "capture.json"
 MANIFEST_BYTES = 4 << 20
 """The largest manifest: about 200 bytes for each of `MAX_FRAMES`."""
 MANIFEST_NODES = 150_000
 """The most objects and lists in it: an empty one takes 2 bytes of text, but 300 bytes of memory while parsing."""
-UNION_TAGS = {"constant", "halftone", "bernoulli", "stripes", "images", "Gamma"}
-"""Names that pydantic inserts in an error's location to say which member of a union it tried."""
 
 EXAMPLE: dict[str, Any] = {
     "format": "envmatte-capture/1",
@@ -145,10 +143,7 @@ def parse_manifest(text: bytes) -> Manifest:
         # Editors and shells of Windows write the mark before UTF-8, which JSON does not have.
         return Manifest.model_validate_json(text.removeprefix(codecs.BOM_UTF8))
     except ValidationError as error:
-        # Each member of a union that was tried gives an error; the deepest one is the most specific.
-        first = max(error.errors(include_url=False), key=lambda e: len(e["loc"]))
-        names = [str(part) for part in first["loc"] if part not in UNION_TAGS]
-        field = ".".join(name for name in names if "[" not in name)
+        field, why = field_and_reason(error.errors(include_url=False))
         raise CaptureError(
-            f"{MANIFEST}: {field + ': ' if field else ''}{reason(first)}", entry=MANIFEST, field=field
+            f"{MANIFEST}: {field + ': ' if field else ''}{why}", entry=MANIFEST, field=field
         ) from error

@@ -1,5 +1,6 @@
 """Why a value does not fit a model, in our words: pydantic's name types of Python, and stay English in the app."""
 
+from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
@@ -40,6 +41,26 @@ TYPES = {
     "model": "must be an object",
 }
 """By the first word of the type of pydantic's error, for values of another type."""
+UNION_TAGS = {"constant", "halftone", "bernoulli", "stripes", "images", "Gamma"}
+"""Names that pydantic inserts in an error's location to say which member of a union it tried."""
+
+
+def field_and_reason(faults: Sequence[ErrorDetails]) -> tuple[str, str]:
+    """The field to correct first, and why its value was refused.
+
+    Examples
+    --------
+    >>> from pydantic import TypeAdapter, ValidationError
+    >>> try:
+    ...     TypeAdapter(dict[str, list[int]]).validate_python({"sizes": [1, "two"]})
+    ... except ValidationError as error:
+    ...     field_and_reason(error.errors())
+    ('sizes.1', 'must be a whole number')
+    """
+    # Each member of a union that was tried gives an error; the deepest one is the most specific.
+    fault = max(faults, key=lambda fault: len(fault["loc"]))
+    names = [str(part) for part in fault["loc"] if part not in UNION_TAGS]
+    return ".".join(name for name in names if "[" not in name), reason(fault)
 
 
 def reason(fault: ErrorDetails) -> str:

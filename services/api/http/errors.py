@@ -13,7 +13,7 @@ from starlette.routing import Match, Mount
 
 from services.runtime.problems import MEDIA_TYPE, Unauthorized, problem_detail, problem_of
 from storage.errors import EnvmatteError, InvalidInput, TooMany, Unavailable
-from workflows.untrusted.validation import reason
+from workflows.untrusted.validation import field_and_reason
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "default": {
@@ -74,10 +74,9 @@ def register(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"][1:])
-        detail = f"{field or first['loc'][0]}: {reason(first)}"
-        return answer(problem_of(InvalidInput(detail, field=field)))
+        name, why = field_and_reason(error.errors())
+        place, _, field = name.partition(".")  # of the request: its body, its query or its headers
+        return answer(problem_of(InvalidInput(f"{field or place}: {why}", field=field)))
 
     @app.exception_handler(ClientDisconnect)
     async def _disconnected(request: Request, error: ClientDisconnect) -> Response:

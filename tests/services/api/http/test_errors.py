@@ -1,10 +1,12 @@
 """Errors as answers: headers that a status needs besides the problem detail."""
 
 import pytest
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.testclient import TestClient
 
+from services.api.http.bodies import read_json
 from services.api.http.errors import register
+from services.api.programs.programs import ProgramRequest
 from services.runtime.problems import Unauthorized
 from storage.errors import EnvmatteError, NotFound, Unavailable
 
@@ -34,3 +36,35 @@ def test_error_is_answered_with_the_header_of_its_status(
     assert {(name, value) for name, value in extra if name != "content-length"} == (
         {header} if header else set()
     )
+
+
+@pytest.mark.parametrize(
+    ("response", "parts", "detail"),
+    [
+        ('{"gamma": 1e-300}', "[]", "program.monitor.response.gamma: must be at least 0.2"),
+        ('{"gamma": NaN}', "[]", "program.monitor.response.gamma: must be a number"),
+        (
+            '"film"',
+            "[]",
+            "program.monitor.response: must be 'linear', 'srgb' or 'unknown'",
+        ),
+        (
+            '"srgb"',
+            '[{"kind": "constant", "levels": [0, 2]}]',
+            "program.parts.0.levels.1: must be at most 1.0",
+        ),
+    ],
+)
+def test_field_of_a_body_is_named_as_its_sender_does(response: str, parts: str, detail: str) -> None:
+    app = FastAPI()
+    register(app)
+
+    @app.post("/")
+    async def read(request: Request) -> None:
+        await read_json(request, ProgramRequest, 1000)
+
+    monitor = f'{{"width": 64, "height": 48, "response": {response}}}'
+    with TestClient(app) as client:
+        answer = client.post("/", content=f'{{"program": {{"monitor": {monitor}, "parts": {parts}}}}}')
+    assert (answer.status_code, answer.json()["detail"]) == (422, detail)
+    assert answer.json()["field"] == detail.partition(":")[0]
