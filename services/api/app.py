@@ -4,7 +4,7 @@ from typing import Any
 
 from fastapi import Depends, FastAPI
 from sqlalchemy import Engine
-from starlette.types import Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 
 from services.api.captures import captures, creation, manifest_schema, reports, tus, uploads
 from services.api.context import Context, authorized
@@ -28,10 +28,18 @@ class App(FastAPI):
     """A FastAPI app that answers HEAD wherever it answers GET, and whose OpenAPI document has capture.json's schema."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        # The server leaves out the body (RFC 9110, sect. 9.3.2). Uploads have a HEAD of their own.
-        if scope["type"] == "http" and scope["method"] == "HEAD" and not scope["path"].startswith(tus.PATH):
-            scope = {**scope, "method": "GET"}
-        await super().__call__(scope, receive, send)
+        # Uploads have a HEAD of their own.
+        if scope["type"] != "http" or scope["method"] != "HEAD" or scope["path"].startswith(tus.PATH):
+            await super().__call__(scope, receive, send)
+            return
+
+        async def send_head(message: Message) -> None:
+            # The body is left out (RFC 9110, sect. 9.3.2). A stream, which may have no end, then stops.
+            if message["type"] == "http.response.start":
+                await send(message)
+                await send({"type": "http.response.body"})
+
+        await super().__call__({**scope, "method": "GET"}, receive, send_head)
 
     def openapi(self) -> dict[str, Any]:
         document = super().openapi()

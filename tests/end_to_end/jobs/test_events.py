@@ -2,6 +2,9 @@
 
 import json
 from collections.abc import Iterator
+from contextlib import closing
+from http.client import HTTPConnection
+from urllib.parse import urlsplit
 
 import httpx2
 
@@ -55,3 +58,16 @@ def test_events_end_when_the_job_is_cancelled_or_deleted(service: Service, captu
         assert [data["state"] for _, data in received][-1] == "cancelled"
     assert service.http.delete(f"/v1/jobs/{job}").status_code == 204
     check_problem(service.http.get(f"/v1/jobs/{job}/events"), 404, "not-found")
+
+
+def test_head_of_a_stream_leaves_the_connection_free(service: Service) -> None:
+    program = service.http.post("/v1/programs", json={"preset": "sketch"}).json()["id"]
+    connection = HTTPConnection(urlsplit(service.url).netloc, timeout=10)
+    with closing(connection):
+        connection.request("HEAD", f"/v1/programs/{program}/events")
+        head = connection.getresponse()
+        assert (head.status, head.read()) == (200, b"")
+        connection.request("GET", f"/v1/programs/{program}/events")
+        answer = connection.getresponse()
+        assert answer.getheader("content-type") == head.getheader("content-type")
+        assert answer.readline()
