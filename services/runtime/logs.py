@@ -71,6 +71,7 @@ def configure_logging(form: str, level: str, role: str) -> None:
             one.propagate = True
     logging.getLogger("distributed").setLevel(max(logging.WARNING, LEVELS[level]))
     logging.getLogger("alembic").setLevel(logging.WARNING)  # it has an INFO line for every step
+    logging.getLogger("uvicorn.error").addFilter(_is_news)
     sys.excepthook = _log_uncaught
     threading.excepthook = lambda args: logger.critical(
         "thread %s ended by an error", args.thread, exc_info=args.exc_value
@@ -111,6 +112,11 @@ def _add_about(record: logging.LogRecord) -> bool:
     record.__dict__ |= fields
     record.about = "".join(f"{name}={value} " for name, value in fields.items())
     return True
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Whether a line of uvicorn says more than ours: why an answer ends early is logged where it ends."""
+    return "returned without completing response" not in record.getMessage()
 
 
 def _log_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -97,19 +97,18 @@ class Archive:
         written = _Tail()
         digests: dict[str, str] = {}
         checked: dict[str, bool] = {}
-        archive = zipfile.ZipFile(cast(IO[bytes], written), "w")
-        for batch in self._batches:
-            for name, data in zip(batch, self._read(batch), strict=True):
-                folder, _, inner = name.rpartition("zarr.json" if name.endswith("zarr.json") else "c/")
-                if not inner:  # comes before the chunks that it describes
-                    checked[folder] = is_checked(unseal(f"{self._path}/{name}", data)[0])
-                if len(data) != self._sizes[name] or (inner and checked[folder] and not is_intact(data)):
-                    raise self._corrupt(name)
-                digests[name] = hashlib.sha256(data).hexdigest()
-                archive.writestr(_entry(name), data)
-            yield written.take()
-        archive.writestr(_entry(MANIFEST), self._manifest(digests))
-        archive.close()
+        with zipfile.ZipFile(cast(IO[bytes], written), "w") as archive:
+            for batch in self._batches:
+                for name, data in zip(batch, self._read(batch), strict=True):
+                    folder, _, inner = name.rpartition("zarr.json" if name.endswith("zarr.json") else "c/")
+                    if not inner:  # comes before the chunks that it describes
+                        checked[folder] = is_checked(unseal(f"{self._path}/{name}", data)[0])
+                    if len(data) != self._sizes[name] or (inner and checked[folder] and not is_intact(data)):
+                        raise self._corrupt(name)
+                    digests[name] = hashlib.sha256(data).hexdigest()
+                    archive.writestr(_entry(name), data)
+                yield written.take()
+            archive.writestr(_entry(MANIFEST), self._manifest(digests))
         yield written.take()
 
     def _read(self, names: list[str]) -> list[bytes]:

@@ -1,5 +1,7 @@
 """Archives of mattes over HTTP: download a matte, all of it or entry by entry, and import it into another service."""
 
+import logging
+from collections.abc import Iterator
 from functools import partial
 from typing import Annotated, Any
 
@@ -18,6 +20,7 @@ from services.api.http.router import Router
 from services.api.limits.quotas import admit
 from services.api.limits.reservations import reserved
 from services.api.mattes.mattes import Matte
+from services.runtime.problems import Unauthorized
 from storage.database.rows import new_id
 from storage.errors import Corrupt, NoRoom, NotFound
 from storage.layout import mattes as stored_mattes
@@ -28,6 +31,7 @@ from storage.records import bodies, mattes
 from workflows.mattes.imports.importing import bytes_of_import, take_in
 from workflows.untrusted.validation import Name
 
+logger = logging.getLogger(__name__)
 router = Router(tags=["mattes"])
 CALL = "POST /v1/mattes"
 BYTES = "application/octet-stream"
@@ -67,12 +71,21 @@ class _Download(Response):
                 "Content-Length": str(archive.size),
                 "Content-Disposition": f'attachment; filename="matte-{self._id}.zip"',
             }
-            pieces = context.while_allowed(archive)
-            await StreamingResponse(pieces, media_type=ZIP, headers=headers)(scope, receive, send)
+            response = StreamingResponse(self._pieces(archive), media_type=ZIP, headers=headers)
+            try:
+                await response(scope, receive, send)
+            except (NotFound, Unauthorized, Corrupt) as error:
+                # The answer has begun, so it can't become a problem: without its end, the server disconnects.
+                level = logging.ERROR if isinstance(error, Corrupt) else logging.INFO
+                logger.log(level, "ended the download of matte %s: %s", self._id, error.detail)
 
     def _open(self) -> Archive:
         with self._context.stored(mattes.get_ready, self._id):
             return Archive(self._context.objects, self._id)
+
+    def _pieces(self, archive: Archive) -> Iterator[bytes]:
+        with self._context.stored(mattes.get_ready, self._id):
+            yield from self._context.while_allowed(archive)
 
 
 @router.get(

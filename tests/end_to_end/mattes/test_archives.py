@@ -168,12 +168,15 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_deleting_a_matte_ends_its_download(elsewhere: Service, large: Path, tmp_path: Path) -> None:
     imported_id = elsewhere.client.import_matte(large)["id"]
+    logged = elsewhere.log()
     sent: list[bytes] = []
     with elsewhere.http.stream("GET", f"/v1/mattes/{imported_id}/archive") as answer:
         assert elsewhere.http.delete(f"/v1/mattes/{imported_id}").status_code == 204
         with pytest.raises(httpx2.RemoteProtocolError):
             sent.extend(answer.iter_bytes())
     assert not zipfile.is_zipfile(io.BytesIO(b"".join(sent)))
+    until(lambda: f"ended the download of matte {imported_id}" in elsewhere.log())
+    assert " ERROR " not in elsewhere.log().removeprefix(logged)
     with pytest.raises(ServiceError, match=imported_id):
         elsewhere.client.export(imported_id, tmp_path / "matte.zip")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""PostgreSQL is restarted while a matte is imported: the import goes on, and leaves one matte."""
+"""Archives while something else happens: the database restarts, or the matte is deleted."""
 
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from sqlalchemy import event
 from services.api.app import build_app
 from services.settings import Settings
 from storage.database.engine import open_engine
+from storage.layout.matte_archive import Archive
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
 from tests.parts.postgres import Server
@@ -51,5 +52,28 @@ def test_import_goes_on_although_the_database_restarts(
         assert client.get(f"/v1/mattes/{made}/archive").content == sent
     assert set(objects.names("mattes")) - {"zarr.json"} == {made}
     assert objects.names("uploads") == []
+    app.state.context.decoders.close()
+    engine.dispose()
+
+
+def test_download_of_a_matte_that_is_deleted_ends_with_a_line_in_the_log(
+    sqlite: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    engine, objects = open_engine(sqlite), Objects((tmp_path / "store").as_uri())
+    app = build_app(Settings(data=tmp_path), engine, objects)
+    with TestClient(app, "http://127.0.0.1") as client:
+        where = (
+            "/v1/mattes/"
+            + client.post("/v1/mattes", content=archive(tmp_path / "made", 100, 80), headers=ZIP).json()["id"]
+        )
+        read = Archive._read
+        monkeypatch.setattr(
+            Archive, "_read", lambda self, names: (client.delete(where), read(self, names))[1]
+        )
+        with caplog.at_level("INFO", "services"):
+            answer = client.get(f"{where}/archive")
+    assert (answer.status_code, len(answer.content) < int(answer.headers["content-length"])) == (200, True)
+    (line,) = [record for record in caplog.records if record.name.startswith("services.api")]
+    assert (line.levelname, "there is no matte" in line.getMessage()) == ("INFO", True)
     app.state.context.decoders.close()
     engine.dispose()
