@@ -85,7 +85,8 @@ def register(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def _unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("%s %s", request.method, request.url.path, exc_info=error)
-        return answer(problem_of(error))
+        # The framework raises the error again, and the server then disconnects.
+        return answer(problem_of(error), {"Connection": "close"})
 
 
 def _methods(request: Request) -> set[str]:

@@ -68,3 +68,16 @@ def test_field_of_a_body_is_named_as_its_sender_does(response: str, parts: str, 
         answer = client.post("/", content=f'{{"program": {{"monitor": {monitor}, "parts": {parts}}}}}')
     assert (answer.status_code, answer.json()["detail"]) == (422, detail)
     assert answer.json()["field"] == detail.partition(":")[0]
+
+
+def test_unexpected_error_announces_that_the_connection_is_closed() -> None:
+    app = FastAPI()
+    register(app)
+
+    @app.get("/")
+    def fail() -> None:
+        raise ValueError
+
+    with TestClient(app, raise_server_exceptions=False) as client:
+        answer = client.get("/")
+    assert (answer.status_code, answer.headers["connection"]) == (500, "close")
