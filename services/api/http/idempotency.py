@@ -32,7 +32,7 @@ def find_earlier(engine: Engine, key: str | None, call: str, read: Read[T]) -> T
         return None
     with reading(engine) as c:
         earlier = find(c, key, call)
-        return None if earlier is None else read(c, earlier)
+        return None if earlier is None else _read_created(c, earlier, read)
 
 
 def idempotent(
@@ -90,7 +90,16 @@ def _once(
             created = create(c)
             if key:
                 add(c, key, call, created)
-        return read(c, created)
+        return _read_created(c, created, read)
+
+
+def _read_created(connection: Connection, id: str, read: Read[T]) -> T:
+    try:
+        return read(connection, id)
+    except NotFound as error:
+        raise NotFound(
+            "what the first request with this Idempotency-Key created has been deleted; use another key"
+        ) from error
 
 
 def _exists(connection: Connection, id: str, read: Read[T]) -> bool:

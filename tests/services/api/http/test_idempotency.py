@@ -54,9 +54,9 @@ def test_repeat_after_deletion_is_not_found(engine: Engine) -> None:
     with writing(engine) as c:
         jobs.end(c, first.id, "cancelled")
         jobs.delete(c, first.id)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFound, match="use another key"):
         find_earlier(engine, "a", CALL, jobs.get)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFound, match="use another key"):
         idempotent(engine, "a", CALL, jobs.get, create)
     assert count(engine) == 0
 
