@@ -116,8 +116,8 @@ def byte_count(request: Request, name: str) -> int:
     return int(text)
 
 
-def refuse_parts(request: Request) -> None:
-    """Refuse an upload that is a part of another, or made of such parts: the extension concatenation.
+def refuse_extensions(request: Request) -> None:
+    """Refuse what other extensions of tus ask for: parts to be joined, and a length that is sent later.
 
     Raises
     ------
@@ -127,6 +127,11 @@ def refuse_parts(request: Request) -> None:
         raise BadHeader(
             "Upload-Concat: uploads are not joined here; send all bytes to one upload, without this header",
             field="Upload-Concat",
+        )
+    if "upload-defer-length" in request.headers:
+        raise BadHeader(
+            "Upload-Defer-Length: the length is needed from the start here; send Upload-Length, without this header",
+            field="Upload-Defer-Length",
         )
 
 

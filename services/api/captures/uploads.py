@@ -18,7 +18,7 @@ from services.api.captures.tus import (
     byte_count,
     declared,
     metadata_of,
-    refuse_parts,
+    refuse_extensions,
     require_version,
 )
 from services.api.context import Context, OwnerContext
@@ -65,7 +65,7 @@ async def create_upload(
     A client that knows `frames`, `width` and `height` of the capture can send them in `Upload-Metadata`: they are
     checked against the limits before any bytes are sent. The capture itself is checked in any case.
     """
-    refuse_parts(request)
+    refuse_extensions(request)
     length = byte_count(request, "Upload-Length")
     upload_limit(context.settings).check(length)
     checksum = Checksum.of(request)
