@@ -16,7 +16,7 @@ Distance = Annotated[float, Field(ge=1e-6, le=1e6)]
 class CompositeParams(BaseModel):
     """What of a composite to compute, and how."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     transfer: Literal["srgb", "linear"] = Field(
         "srgb", description="How the backdrop, and an answer of 8 or 16 bits, encode light."
     )

@@ -67,7 +67,7 @@ class Links(BaseModel):
 class LinkRequest(BaseModel):
     """How long a link leads to the matte."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     days: float = Field(default=30, gt=0, le=3650, description="Days until the link expires, a fraction too.")
 
 

@@ -65,7 +65,8 @@ async def get_film(
     program: Stored,
     request: Request,
     rate: Annotated[
-        float, Query(ge=video.SLOWEST, le=video.FASTEST, description="Patterns per second.")
+        float,
+        Query(ge=video.SLOWEST, le=video.FASTEST, allow_inf_nan=False, description="Patterns per second."),
     ] = 2.0,
 ) -> Response:
     """A video of the lead-in, the patterns in a border, and the lead-out. It is encoded before the answer begins."""

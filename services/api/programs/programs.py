@@ -78,7 +78,7 @@ class ProgramRequest(BaseModel):
 class PlaybackState(BaseModel):
     """How far the page that plays a program is."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     playback: str | None = Field(
         None,
         max_length=64,

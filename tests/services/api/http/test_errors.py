@@ -3,10 +3,13 @@
 import pytest
 from fastapi import FastAPI, Request
 from fastapi.testclient import TestClient
+from pydantic import BaseModel
 
 from services.api.http.bodies import read_json
 from services.api.http.errors import register
-from services.api.programs.programs import ProgramRequest
+from services.api.mattes.composite_params import CompositeParams
+from services.api.mattes.links import LinkRequest
+from services.api.programs.programs import PlaybackState, ProgramRequest
 from services.runtime.problems import Unauthorized
 from storage.errors import EnvmatteError, NotFound, Unavailable
 
@@ -68,6 +71,27 @@ def test_field_of_a_body_is_named_as_its_sender_does(response: str, parts: str, 
         answer = client.post("/", content=f'{{"program": {{"monitor": {monitor}, "parts": {parts}}}}}')
     assert (answer.status_code, answer.json()["detail"]) == (422, detail)
     assert answer.json()["field"] == detail.partition(":")[0]
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "field"),
+    [
+        (CompositeParams, "", "right"),
+        (LinkRequest, "", "days"),
+        (PlaybackState, '"phase": "shown", ', "patterns_per_second"),
+    ],
+)
+def test_what_is_not_a_number_is_refused_as_such(model: type[BaseModel], given: str, field: str) -> None:
+    app = FastAPI()
+    register(app)
+
+    @app.post("/")
+    async def read(request: Request) -> None:
+        await read_json(request, model, 1000)
+
+    with TestClient(app) as client:
+        answer = client.post("/", content=f'{{{given}"{field}": NaN}}')
+    assert answer.json()["detail"] == f"{field}: must be a number"
 
 
 def test_unexpected_error_announces_that_the_connection_is_closed() -> None:
