@@ -9,6 +9,7 @@ from starlette.types import Message, Receive, Scope, Send
 from services.api.captures import captures, creation, manifest_schema, reports, tus, uploads
 from services.api.context import Context, authorized
 from services.api.http import errors
+from services.api.http.media_types import refuse_coded_body
 from services.api.jobs import events, jobs
 from services.api.mattes import archives, clips, composites, layers, links, live, mattes
 from services.api.programs import pattern_files, playback, programs
@@ -93,7 +94,9 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         cluster.router,
         network.router,
     ):
-        app.include_router(router, prefix="/v1", dependencies=[Depends(authorized)])
+        app.include_router(
+            router, prefix="/v1", dependencies=[Depends(authorized), Depends(refuse_coded_body)]
+        )
     app.include_router(pattern_files.page, prefix="/v1")
     app.include_router(qr_codes.page, prefix="/v1")
     app.include_router(links.page)

@@ -33,6 +33,10 @@ class WrongMediaType(InvalidInput):
     """A body of another media type than the route takes."""
 
 
+class CodedBody(WrongMediaType):
+    """A body with a content coding, such as gzip."""
+
+
 class NotAcceptable(InvalidInput):
     """An Accept header without any media type that the route can answer in."""
 

@@ -11,7 +11,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match, Mount
 
-from services.runtime.problems import MEDIA_TYPE, Unauthorized, problem_detail, problem_of
+from services.runtime.problems import MEDIA_TYPE, CodedBody, Unauthorized, problem_detail, problem_of
 from storage.errors import EnvmatteError, InvalidInput, TooMany, Unavailable
 from workflows.untrusted.validation import field_and_reason
 
@@ -42,6 +42,7 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
 """The answer that every route may give, for OpenAPI."""
 HEADERS: dict[type[EnvmatteError], dict[str, str]] = {
     Unauthorized: {"WWW-Authenticate": "Bearer"},
+    CodedBody: {"Accept-Encoding": "identity"},
     Unavailable: {"Retry-After": "2"},  # seconds
     TooMany: {"Retry-After": "10"},
 }

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from fastapi import Request
 
-from services.runtime.problems import WrongMediaType
+from services.runtime.problems import CodedBody, WrongMediaType
 
 ZIP = "application/zip"
 JSON = "application/json"
@@ -32,6 +32,21 @@ def require_media_type(request: Request, media_type: str, what: str) -> None:
     given = media_type_of(request)
     if given != media_type:
         raise WrongMediaType(f"send {what} as {media_type}, not as {given or 'nothing'}")
+
+
+async def refuse_coded_body(request: Request) -> None:
+    """Refuse a body with a content coding (RFC 9110, sect. 15.5.16): it would be read as if it had none.
+
+    Raises
+    ------
+    CodedBody
+    """
+    coding = request.headers.get("content-encoding", "identity")
+    if coding.strip().lower() != "identity":
+        raise CodedBody(
+            f"Content-Encoding: bodies in {coding!r} are not taken; send this one as it is, without this header",
+            field="Content-Encoding",
+        )
 
 
 def preferred(accept: str, offered: Sequence[str]) -> str | None:

@@ -1,9 +1,12 @@
 """What holds for every route of the app, whatever it does."""
 
+from collections.abc import Iterator
 from inspect import iscoroutinefunction
 
 import pytest
+from fastapi import FastAPI
 from fastapi.routing import APIRoute
+from fastapi.testclient import TestClient
 
 from services.api.app import build_app
 from services.settings import Settings
@@ -12,11 +15,15 @@ from storage.objects.store import Objects
 
 
 @pytest.fixture(scope="module")
-def routes(tmp_path_factory: pytest.TempPathFactory) -> list[APIRoute]:
+def app(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FastAPI]:
     data = tmp_path_factory.mktemp("data")
     engine = open_engine(f"sqlite:///{data}/envmatte.db")
-    app = build_app(Settings(data=data), engine, Objects((data / "store").as_uri()))
+    yield build_app(Settings(data=data), engine, Objects((data / "store").as_uri()))
     engine.dispose()
+
+
+@pytest.fixture(scope="module")
+def routes(app: FastAPI) -> list[APIRoute]:
     routers = [one.original_router for one in app.routes if hasattr(one, "original_router")]
     return [route for router in routers for route in router.routes if isinstance(route, APIRoute)]
 
@@ -30,3 +37,13 @@ def test_no_route_takes_a_thread_out_of_turn(routes: list[APIRoute]) -> None:
 def test_no_route_leaves_its_body_to_fastapi(routes: list[APIRoute]) -> None:
     """It reads a body whole, however large it is."""
     assert [route.path for route in routes if route.body_field is not None] == []
+
+
+@pytest.mark.parametrize("route", ["captures", "jobs", "mattes", "mattes/m/composite", "programs", "uploads"])
+def test_body_with_a_content_coding_is_refused(app: FastAPI, route: str) -> None:
+    client = TestClient(app, "http://127.0.0.1")
+    answer = client.post(f"/v1/{route}", content=b"{}", headers={"Content-Encoding": "gzip"})
+    assert (answer.status_code, answer.headers["accept-encoding"]) == (415, "identity")
+    assert answer.json()["field"] == "Content-Encoding"
+    answer = client.post(f"/v1/{route}", content=b"{}", headers={"Content-Encoding": "Identity"})
+    assert answer.json().get("field") != "Content-Encoding"
