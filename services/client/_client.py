@@ -236,8 +236,8 @@ class Client:
         Parameters
         ----------
         backdrop : bytes, Path, or (height, width) or (height, width, 3) float array
-            An image (PNG, JPEG, WebP, AVIF, GIF, TIFF, HEIC, EXR or camera RAW), or an array of linear light. It is
-            stretched over the monitor.
+            An image (PNG, JPEG, WebP, AVIF, GIF, TIFF, HEIC, EXR, Radiance HDR or camera RAW), or an array of linear
+            light. It is stretched over the monitor.
         kind : str
             Media type of the bytes: ``image/png``, ``image/jpeg`` or ``image/x-exr``.
         **wanted

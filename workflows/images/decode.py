@@ -24,7 +24,8 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     Parameters
     ----------
     data : bytes
-        PNG, JPEG, WebP, AVIF, GIF, TIFF, HEIC, EXR or camera RAW. Of a moving picture the first frame is decoded.
+        PNG, JPEG, WebP, AVIF, GIF, TIFF, HEIC, EXR, Radiance HDR or camera RAW. Of a moving picture the first frame is
+        decoded.
     transfer : str
         How integers encode light. Colours with an ICC profile are converted to sRGB, unless this is ``linear``. RAW
         and floats are linear light in any case, and that of an EXR is converted from the primaries that it names.

@@ -1,8 +1,10 @@
-"""EXR and float TIFF to arrays and back: linear light without an upper limit."""
+"""EXR, Radiance HDR and float TIFF to arrays, and EXR back: linear light without an upper limit."""
 
 import io
+import re
 from contextlib import suppress
 
+import imagecodecs
 import numpy as np
 import OpenEXR
 import tifffile
@@ -18,6 +20,8 @@ from workflows.untrusted.limits import check_size
 Floats = NDArray[np.float32]
 EXR = b"v/1\x01"
 """The first bytes of an EXR."""
+HDR = b"#?"
+"""Those of a Radiance HDR."""
 REC_709 = np.array([0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290], np.float32)
 """x and y of red, green, blue and white: the attribute ``chromaticities`` of an EXR whose light has these primaries."""
 MOST = 100
@@ -27,8 +31,8 @@ _CONES = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389
 
 
 def is_float(data: bytes) -> bool:
-    """Whether bytes are an EXR or a float TIFF, judging by their header."""
-    if data.startswith(EXR):
+    """Whether bytes are an EXR, a Radiance HDR or a float TIFF, judging by their header."""
+    if data.startswith((EXR, HDR)):
         return True
     if not data.startswith((b"II", b"MM")):
         return False
@@ -40,7 +44,7 @@ def is_float(data: bytes) -> bool:
 
 
 def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
-    """Decode an EXR or a float TIFF.
+    """Decode an EXR, a Radiance HDR or a float TIFF.
 
     Parameters
     ----------
@@ -48,7 +52,7 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
     memory : int
         Bytes that decoding may take; checked by the header, before anything is decoded.
     turn : int, optional
-        Orientation of a TIFF, see `orientation.upright`; by default the file's own. An EXR has none.
+        Orientation of a TIFF, see `orientation.upright`; by default the file's own. The others have none.
 
     Returns
     -------
@@ -61,14 +65,15 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
     ImageError
         If it is damaged, too large, or of an unsupported kind.
     """
-    kind, read = ("EXR", _exr) if data.startswith(EXR) else ("TIFF", _tiff)
+    readers = {EXR: ("EXR", _exr), HDR: ("HDR", _hdr)}
+    kind, read = next((reader for mark, reader in readers.items() if data.startswith(mark)), ("TIFF", _tiff))
     try:
         pixels = read(data, memory)
     except ImageError:
         raise
     except Exception as error:  # as above
         raise ImageError(f"the {kind} image is cut off or damaged: export it again") from error
-    if kind == "EXR":
+    if kind != "TIFF":
         return pixels
     return upright(pixels, orientation(data) if turn is None else turn)
 
@@ -165,6 +170,19 @@ def _exr(data: bytes, memory: int) -> Floats:
         stored_columns, stored_rows = map(slice, first - data_low, end - data_low)
         for c, name in enumerate(names):
             pixels[rows, columns, c] = planes[name].pixels[stored_rows, stored_columns]
+    return pixels
+
+
+def _hdr(data: bytes, memory: int) -> Floats:
+    """Three values with one exponent (Ward, "Real pixels", Graphics Gems II, 1991)."""
+    header, _, rest = data.partition(b"\n\n")
+    size = re.match(rb"-Y (\d{1,9}) \+X (\d{1,9})\n", rest)
+    if b"\nFORMAT=32-bit_rle_rgbe" not in header or size is None:
+        raise ImageError("this HDR image is no upright RGB: export it as EXR")
+    height, width = map(int, size.groups())
+    check_size(width, height, 16, memory, "float pixels")
+    pixels = np.empty((height, width, 3), np.float32)
+    imagecodecs.rgbe_decode(rest[size.end() :], header=False, rle=True, out=pixels)
     return pixels
 
 

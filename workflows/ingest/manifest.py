@@ -41,8 +41,8 @@ class Frame(BaseModel):
 
     model_config = ConfigDict(frozen=True)
     file: str = Field(
-        description="Name of the image in the archive: PNG, TIFF, JPEG, HEIC, EXR or camera RAW. All frames have one "
-        "size and kind.",
+        description="Name of the image in the archive: PNG, TIFF, JPEG, HEIC, EXR, Radiance HDR or camera RAW. All "
+        "frames have one size and kind.",
         examples=["frames/00000.png"],
     )
     pattern: int = Field(

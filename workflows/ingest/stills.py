@@ -97,7 +97,7 @@ def header(decoder: Decoder, archive: CaptureArchive, entry: str) -> Header:
 
 
 def read(decoder: Decoder, archive: CaptureArchive, entry: str, turn: int | None = None) -> Codes | Floats:
-    """Decode a frame: PNG, TIFF, JPEG, HEIC, EXR or camera RAW.
+    """Decode a frame: PNG, TIFF, JPEG, HEIC, EXR, Radiance HDR or camera RAW.
 
     Parameters
     ----------

@@ -1,10 +1,11 @@
-"""EXR and float TIFF: the very values, and nothing but ImageError from damaged or hostile files."""
+"""EXR, Radiance HDR and float TIFF: the very values, and nothing but ImageError from damaged or hostile files."""
 
 import io
 import struct
 import tracemalloc
 from typing import Any
 
+import imagecodecs
 import numpy as np
 import OpenEXR
 import pytest
@@ -34,6 +35,12 @@ def exr(
         target
     )
     return target.getvalue()
+
+
+def hdr(pixels: NDArray[np.float32]) -> bytes:
+    written = bytes(imagecodecs.rgbe_encode(pixels, header=True))
+    head, size, rest = written.partition(b"-Y")
+    return head.replace(b"FORMAT", b"# made by a test\nEXPOSURE=1.0\nFORMAT") + size + rest
 
 
 def tiff(pixels: NDArray[Any], **options: Any) -> bytes:
@@ -71,6 +78,20 @@ def test_a_float_tiff_is_read_exactly(dtype: str, compression: str | None) -> No
         np.testing.assert_array_equal(decode(data, memory=MEMORY), expected.astype(np.float32))
 
 
+@pytest.mark.parametrize(
+    "shape", [pytest.param((9, 16, 3), id="run-length"), pytest.param((3, 5, 3), id="plain")]
+)
+def test_a_radiance_hdr_is_read(shape: tuple[int, int, int]) -> None:
+    random = np.random.default_rng(2)
+    light = (100 * random.random((*shape[:2], 1)) ** 8 * random.random(shape)).astype(np.float32)
+    data = hdr(light)
+    assert is_float(data)
+    found = decode(data, memory=MEMORY)
+    assert found.dtype == np.float32
+    # The largest of three values has eight bits, and the others the same step.
+    assert (np.abs(found - light) <= light.max(axis=2, keepdims=True) / 100).all()
+
+
 def test_integers_and_others_are_no_floats() -> None:
     for data in (b"", b"II", b"MM\0*" + bytes(20), b"\x89PNG", tiff(np.ones((4, 4), np.uint16))):
         assert not is_float(data)
@@ -99,6 +120,9 @@ def test_integers_and_others_are_no_floats() -> None:
             tiff(np.ones((9, 9, 7), np.float32), photometric="minisblack", planarconfig="contig"),
             "grey (and|or) RGB",
         ),
+        (hdr(VALUES[1:, :, :3]).replace(b"-Y", b"+Y"), "no upright RGB"),
+        (hdr(VALUES[1:, :, :3]).replace(b"rgbe", b"xyze"), "no upright RGB"),
+        (hdr(VALUES[1:, :, :3]).replace(b"-Y 18", b"-Y 9999999"), "float pixels"),
     ],
 )
 def test_unsupported_files_are_refused(data: bytes, why: str | None) -> None:
@@ -192,10 +216,14 @@ def test_tiff_with_text_as_its_width_takes_no_memory() -> None:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("kind", ["exr", "tiff"])
+@pytest.mark.parametrize("kind", ["exr", "hdr", "tiff"])
 def test_a_truncated_file_is_refused(kind: str) -> None:
     planes = {name: VALUES[:, :, c] for c, name in enumerate("RGB")}
-    data = exr(planes) if kind == "exr" else tiff(VALUES[:, :, :3], photometric="rgb", compression="zlib")
+    data = {
+        "exr": lambda: exr(planes),
+        "hdr": lambda: hdr(np.abs(VALUES[1:, :, :3])),
+        "tiff": lambda: tiff(VALUES[:, :, :3], photometric="rgb", compression="zlib"),
+    }[kind]()
     for length in np.linspace(4, len(data) * 0.95, 30).astype(int):
         with pytest.raises(ImageError):
             decode(data[:length], memory=MEMORY)

@@ -9,7 +9,7 @@ const ENDS = /\.(mp4|m4v|mov|mkv|webm|avi|3gp|mts|m2ts)$/i;
 // Browsers know no type of MKV, and give MTS that of something else.
 export const isFilm = (file) => file.type.startsWith("video/") || ENDS.test(file.name);
 // What a field for files takes: the last are the usual names of camera RAW.
-export const STILLS = "image/*,.heic,.heif,.hif,.exr,.tif,.tiff,.dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2";
+export const STILLS = "image/*,.heic,.heif,.hif,.exr,.hdr,.tif,.tiff,.dng,.nef,.cr2,.cr3,.arw,.raf,.orf,.rw2";
 const STILL_ENDS = new RegExp(`(${STILLS.split(",").slice(1).join("|").replaceAll(".", "\\.")})$`, "i");
 export const isStill = (file) => file.type.startsWith("image/") || STILL_ENDS.test(file.name);
 

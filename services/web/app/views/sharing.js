@@ -15,7 +15,7 @@ export function sharing(id, signal) {
 	const links = h("ul.list");
 
 	const row = ({ id: link, created_at: created, expires_at: expires }) => {
-		const end = button(t("delete"), problem, async () => {
+		const end = button(t("share.delete"), problem, async () => {
 			await remove(`${path}/${link}`);
 			if (made.dataset.link === link) made.replaceChildren();
 			item.remove();
