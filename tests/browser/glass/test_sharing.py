@@ -30,7 +30,7 @@ def test_link_is_made_used_and_deleted(
     assert answer.status == 200
     expect(reader.locator("#choices")).to_be_visible()
     reader.close()
-    panel.get_by_role("button", name="Delete", exact=True).first.click()
+    panel.get_by_role("button", name="Delete the link").first.click()
     expect(panel.get_by_role("listitem")).to_have_count(before)
     expect(link).to_have_count(0)
     until(lambda: service.http.get(url).status_code == 404)

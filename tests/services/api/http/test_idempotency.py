@@ -52,7 +52,7 @@ def test_key_counts_once_for_each_route(engine: Engine) -> None:
 def test_repeat_after_deletion_is_not_found(engine: Engine) -> None:
     first = idempotent(engine, "a", CALL, jobs.get, create)
     with writing(engine) as c:
-        jobs.end(c, first.id, "cancelled")
+        jobs.end(c, first.id, "failed", {"detail": "its capture is damaged"})
         jobs.delete(c, first.id)
     with pytest.raises(NotFound, match="use another key"):
         find_earlier(engine, "a", CALL, jobs.get)
