@@ -1,6 +1,7 @@
 """The process that workers are forked from, with what they need already imported."""
 
 import os
+import sys
 from multiprocessing import forkserver
 
 import dask
@@ -26,6 +27,10 @@ def start_forkserver(*modules: str) -> None:
     """
     for name, value in dask.config.get("distributed.nanny.pre-spawn-environ").items():
         os.environ[name] = str(value)  # as nannies do, but before libraries that read it are loaded
+    # Workers run the code of this process. Otherwise Python would look in the working directory first, where a clone or
+    # anyone's folder may have a `services`. Both stay set, because a fork server that dies is started again.
+    os.environ["PYTHONSAFEPATH"] = "1"
+    os.environ["PYTHONPATH"] = os.pathsep.join(map(os.path.abspath, sys.path))
     try:
         get_mp_context().Lock()
     except OSError as error:

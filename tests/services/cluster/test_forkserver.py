@@ -1,11 +1,19 @@
-"""The process that workers are forked from, where it can't start."""
+"""The process that workers are forked from: what it imports, and where it can't start."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from tests.parts.processes import running
+from tests.parts.waiting import until
+from tests.services.cluster.clusters import workers
+
+INSTALLED = "import sys; del sys.path[0]; from services.cli.main import run; run()"
+"""Runs the command as its script does, for which the working directory is not on the path."""
+ROOT = Path(__file__).parents[3]
 UNWRITABLE = 'mount -t tmpfs -o ro none /dev/shm && exec "$@"'
 
 
@@ -22,3 +30,14 @@ def test_machine_without_shared_memory_is_named(tmp_path: Path) -> None:
         "/dev/shm"
     )
     assert "Traceback" not in served.stderr
+
+
+def test_workers_do_not_run_the_code_of_the_working_directory(tmp_path: Path) -> None:
+    (tmp_path / "services").mkdir()
+    (tmp_path / "services" / "__init__.py").write_text("open('imported', 'w').close(); raise SystemExit")
+    serve = [sys.executable, "-c", INSTALLED, "serve", "--port", "0", "--workers", "1"]
+    with running(serve, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}) as process:
+        until(lambda: workers(process) or (tmp_path / "imported").exists())
+        assert not (tmp_path / "imported").exists()
+        process.terminate()
+        process.wait(60)
