@@ -1,8 +1,9 @@
 """The process that workers are forked from, with what they need already imported."""
 
 import os
+import signal
 import sys
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 
 import dask
 from distributed.utils import get_mp_context
@@ -38,4 +39,18 @@ def start_forkserver(*modules: str) -> None:
             f"processes can't share locks here: {error.strerror}. Mount a tmpfs that this user may write to on /dev/shm"
         ) from error
     get_mp_context().set_forkserver_preload([*modules])  # replaces what distributed has set
-    forkserver.ensure_running()
+    ensure_running()
+
+
+def ensure_running() -> None:
+    """Start the fork server again if it has died, and the resource tracker too.
+
+    A terminal sends Ctrl-C to all processes of a command. It is for the one that started these, which ends them in
+    order: the fork server and all workers inherit that it is blocked, from their first moment on.
+    """
+    resource_tracker.ensure_running()  # it unblocks the signal where it starts
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])

@@ -2,12 +2,13 @@
 
 import asyncio
 import logging
-from multiprocessing import forkserver
 from typing import Any
 
 import distributed
 from distributed.core import Status
 from tornado.ioloop import PeriodicCallback
+
+from services.cluster.forkserver import ensure_running
 
 logger = logging.getLogger(__name__)
 
@@ -29,12 +30,13 @@ class Nanny(distributed.Nanny):  # type: ignore[misc]
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self.periodic_callbacks["servers"] = PeriodicCallback(forkserver.ensure_running, LOOK * 1e3)
+        self.periodic_callbacks["servers"] = PeriodicCallback(ensure_running, LOOK * 1e3)
 
     async def instantiate(self) -> Status:
         """Start the worker process, or wait until it has started."""
         while True:
             try:
+                ensure_running()  # multiprocessing would start one that Ctrl-C reaches
                 return await super().instantiate()
             except SERVER_DIED:
                 if self.status in (Status.closing, Status.closed):

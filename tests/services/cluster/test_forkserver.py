@@ -1,6 +1,7 @@
-"""The process that workers are forked from: what it imports, and where it can't start."""
+"""The process that workers are forked from: what it imports, what reaches it, and where it can't start."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -41,3 +42,29 @@ def test_workers_do_not_run_the_code_of_the_working_directory(tmp_path: Path) ->
         assert not (tmp_path / "imported").exists()
         process.terminate()
         process.wait(60)
+
+
+@pytest.mark.parametrize("replaced", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_ctrl_c_in_a_terminal_ends_a_service_without_tracebacks(tmp_path: Path, replaced: bool) -> None:
+    serve = [
+        sys.executable,
+        "-m",
+        "services",
+        "serve",
+        "--data",
+        str(tmp_path),
+        "--port",
+        "0",
+        "--workers",
+        "1",
+    ]
+    with running(serve, start_new_session=True) as process:
+        assert process.stdout is not None
+        assert " at http" in process.stdout.readline()
+        (worker,) = workers(process)
+        if replaced:
+            worker.parent().kill()
+            until(lambda: {*workers(process)} - {worker})
+        os.killpg(process.pid, signal.SIGINT)
+        _, log = process.communicate(timeout=120)
+    assert (process.returncode, "Interrupted." in log, "Traceback" in log) == (130, True, False), log
