@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from storage.errors import Conflict
+from storage.errors import Conflict, Unavailable
 
 logger = logging.getLogger(__name__)
 
@@ -20,11 +20,16 @@ def make_data(data: Path) -> None:
     ------
     Conflict
         If it is a file.
+    Unavailable
+        If it can't be made.
     """
     if data.is_file():
         raise Conflict(f"{data} is a file: name a folder with --data")
     if not data.exists():
-        data.mkdir(mode=0o700, parents=True, exist_ok=True)
+        try:
+            data.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as error:
+            raise _unwritable(data, error) from error
     elif data.stat().st_mode & 0o077:
         logger.warning("other users of this machine can enter %s; `chmod 700 %s` keeps them out", data, data)
 
@@ -37,8 +42,14 @@ def lock_data(data: Path) -> Iterator[None]:
     ------
     Conflict
         If another process holds it.
+    Unavailable
+        If the folder can't be written to.
     """
-    with (data / "lock").open("a") as lock:
+    try:
+        lock = (data / "lock").open("a")
+    except OSError as error:
+        raise _unwritable(data, error) from error
+    with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -46,3 +57,8 @@ def lock_data(data: Path) -> Iterator[None]:
                 f"another envmatte serves {data} already; use it, stop it, or name another folder with --data"
             ) from error
         yield
+
+
+def _unwritable(data: Path, error: OSError) -> Unavailable:
+    reason = (error.strerror or str(error)).lower()
+    return Unavailable(f"can't write to {data} ({reason}): name another folder with --data")

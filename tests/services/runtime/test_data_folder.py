@@ -1,12 +1,14 @@
-"""The data folder: who can enter it."""
+"""The data folder: who can enter it, and where it can't be written to."""
 
+import errno
+import os
 import stat
 from pathlib import Path
 
 import pytest
 
-from services.runtime.data_folder import make_data
-from storage.errors import Conflict
+from services.runtime.data_folder import lock_data, make_data
+from storage.errors import Conflict, Unavailable
 
 
 def test_a_new_folder_is_its_owners_alone(tmp_path: Path) -> None:
@@ -33,3 +35,16 @@ def test_rights_to_an_old_folder_are_left_alone_and_reported(
     tmp_path.chmod(0o700)
     make_data(tmp_path)
     assert not caplog.text
+
+
+def test_a_folder_that_cannot_be_written_to_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*given: object, **options: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    monkeypatch.setattr(Path, "open", refuse)
+    message = r"can't write to .* \(read-only file system\): name another folder with --data"
+    with pytest.raises(Unavailable, match=message):
+        make_data(tmp_path / "new")
+    with pytest.raises(Unavailable, match=message), lock_data(tmp_path):
+        pass
