@@ -65,8 +65,9 @@ def patterns(
 ) -> None:
     """Write the patterns of PROGRAM, a preset or a JSON file with a program, to OUT.
 
-    If OUT ends in .mp4 or .mkv, it is a video, with a border and a lead-in by which a film of it can be read, and the
-    capture.json for that film is written beside it. Play it with software decoding, as VLC and mpv can.
+    If OUT ends in .mp4 or .mkv, it is a video, with a border and a lead-in by which a film of it can be read, and a
+    .json of the same name is written beside it, which `envmatte pack` takes with the film. Play the video with software
+    decoding, as VLC and mpv can.
 
     Otherwise OUT is a new folder with a PNG of each pattern, and program.json for the capture.
     """

@@ -58,7 +58,7 @@ def tether(
     matte's id.
 
     The first of the STILLS by name shows the first pattern, and so on. A FILM must be of a kind that can be read while
-    it grows, .mkv or .webm; its PROGRAM is the capture.json beside the video of the patterns.
+    it grows, .mkv or .webm; its PROGRAM is the .json beside the video of the patterns.
 
     From eight patterns on there is a draft, and as soon as that is done another one, of all that has been taken by
     then. The last matte is the best that it gives; drafts are deleted once there is a better one.

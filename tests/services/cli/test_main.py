@@ -98,6 +98,12 @@ def test_every_command_that_prints_prints_json(name: str) -> None:
     assert any("--json" in parameter.opts for parameter in ALL[name].params) == leaf
 
 
+def test_help_names_the_file_beside_a_video_as_it_is_written() -> None:
+    for name in ("patterns", "tether"):
+        described = CliRunner().invoke(main, [name, "--help"]).stdout
+        assert (".json" in described, "capture.json" in described) == (True, False), name
+
+
 def test_exit_codes_agree_between_readme_docstring_and_help() -> None:
     table = re.findall(
         r"^\| (\d+) \| (.*) \|$", README.partition("| exit code | |")[2].partition("\n\n")[0], re.M
