@@ -128,6 +128,11 @@ def revoke(name: str, as_json: bool, **given: Any) -> None:
 
     with _opened(given) as engine, writing(engine) as connection:
         api_keys.revoke(connection, name)
+        left = any(row.revoked_at is None for row in api_keys.list_all(connection))
+    if not left:
+        click.echo(
+            "no key is left in the database, and requests still need one: `envmatte keys make NAME`", err=True
+        )
     click.echo(json.dumps({"name": name, "revoked": True}, indent=2) if as_json else f"{name}: revoked")
 
 

@@ -33,6 +33,17 @@ def test_a_key_says_which_database_has_it_and_who_does_not_see_what(
     assert CliRunner().invoke(main, ["keys", "list"]).stdout.startswith("lab\talice")
 
 
+def test_revoking_the_last_key_says_that_requests_still_need_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("lab", "home"):
+        CliRunner().invoke(main, ["keys", "make", name])
+    first, last = (CliRunner().invoke(main, ["keys", "revoke", name]) for name in ("lab", "home"))
+    assert (first.stderr, last.stdout) == ("", "home: revoked\n")
+    assert "requests still need one: `envmatte keys make NAME`" in last.stderr
+
+
 @pytest.mark.parametrize("words", [("list",), ("revoke", "lab")])
 def test_no_database_is_made_to_look_for_keys(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
