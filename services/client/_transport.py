@@ -1,5 +1,6 @@
 """Requests over HTTP: failures become a `ServiceError`, and requests that are safe to repeat are retried."""
 
+import logging
 import random
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -11,6 +12,8 @@ from typing import Any, TypeVar
 import httpx2
 
 from services.client._errors import OF_STATUS, Busy, ServiceError, Unreachable
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 Body = bytes | Callable[[], Iterable[bytes]]
@@ -100,6 +103,8 @@ class Transport:
                 wait = max(error.retry_after or 0.0, pause * random.uniform(0.5, 1))
                 if not again or time.monotonic() + wait > give_up:
                     raise
+                if isinstance(error, Unreachable) and pause == FIRST_PAUSE:
+                    logger.warning("no answer from %s; trying again for %g s", self._http.base_url, PATIENCE)
             time.sleep(wait)
             pause = min(2 * pause, LONGEST_PAUSE)
 

@@ -10,7 +10,7 @@ from services.cli import options
 from services.cli.output import example, print_result
 from services.cli.programs import is_film
 from services.cli.progress import Progress
-from services.client import Capture, Client
+from services.client import Busy, Capture, Client, Unreachable
 
 _webhook = click.option("--webhook", metavar="URL", help="URL to notify when the job has ended.")
 
@@ -83,6 +83,9 @@ def recover(
                     f"The job continues: envmatte wait {job.id}, or envmatte cancel {job.id}",
                     err=True,
                 )
+                raise
+            except (Unreachable, Busy):
+                click.echo(f"The job continues when the service does: envmatte wait {job.id}", err=True)
                 raise
     print_result(job.answer, as_json, "id" if detach else "matte")
 

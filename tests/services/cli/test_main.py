@@ -18,6 +18,7 @@ from click.testing import CliRunner
 
 from services.cli.main import main
 from services.cli.remote import jobs, mattes
+from services.client import Unreachable
 from services.settings import (
     ClusterSettings,
     CoordinatorSettings,
@@ -259,6 +260,19 @@ def test_exit_code_130_and_a_way_to_continue_after_an_interrupted_recovery() -> 
     assert code == 130
     assert "envmatte wait j" in stderr
     assert not any("cancel" in call["call"] for call in calls)
+
+
+def test_a_service_that_stops_while_a_command_waits_is_reported(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("services.client._transport.PATIENCE", 0.5)
+    with scripted_server(lambda n: ok() if n < 2 else None) as (url, _):
+        given_up = CliRunner().invoke(main, ["recover", "c", "--url", url])
+    assert isinstance(given_up.exception, Unreachable)
+    assert "The job continues when the service does: envmatte wait j" in given_up.stderr
+    assert [record.getMessage() for record in caplog.records if "trying again" in record.getMessage()] == [
+        f"no answer from {url}; trying again for 0.5 s"
+    ]
 
 
 @pytest.mark.parametrize("width", [80, 100])
