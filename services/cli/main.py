@@ -1,6 +1,7 @@
 """The command `envmatte`: all of its commands, and what errors end it with."""
 
 import io
+import re
 import sys
 from typing import Any
 
@@ -85,7 +86,9 @@ def run() -> None:
     try:
         main(standalone_mode=False, prog_name="envmatte")
     except ServiceError as error:
-        _end(f"Error: {error}", 3 if isinstance(error, Unreachable | Busy) else 1)
+        # Of the API's calls that errors name, people have this one as a command.
+        detail = re.sub(r"GET /v1/(captures|jobs|mattes) lists", r"`envmatte list \1` lists", str(error))
+        _end(f"Error: {detail}", 3 if isinstance(error, Unreachable | Busy) else 1)
     except OSError as error:
         _end(f"Error: {error}", 1)
     except click.ClickException as error:

@@ -145,6 +145,13 @@ def test_exit_code_1_if_refused_failed_or_not_written(tmp_path: Path) -> None:
         assert not calls
 
 
+def test_errors_name_commands_in_place_of_calls() -> None:
+    detail = "there is no capture 'nope'; GET /v1/captures lists them"
+    with scripted_server(lambda n: refusal(404, detail)) as (url, _):
+        found = envmatte("recover", "nope", "--url", url)
+    assert found.stderr == "Error: there is no capture 'nope'; `envmatte list captures` lists them\n"
+
+
 def test_errors_do_not_command_the_terminal() -> None:
     with scripted_server(lambda n: refusal(422, "a\x1b[2J\x9b31m\x1b]0;title\x07.png")) as (url, _):
         assert (
