@@ -62,9 +62,11 @@ def serve(**given: Any) -> None:
     """Run the service: API and web app, with database, store and workers on this machine unless others are named."""
     from services.cluster.dask_config import configure_dask
     from services.cluster.forkserver import PRELOAD, start_forkserver
+    from services.runtime.kernel_cache import require_kernel_cache
     from services.settings import Settings
 
     settings = Settings(**drop_unset(given))
+    require_kernel_cache()
     configure_dask()  # which says how processes are started
     if settings.coordinate and settings.cluster is None:
         start_forkserver(PRELOAD)  # at the same time as this process imports the rest
@@ -87,6 +89,9 @@ def serve(**given: Any) -> None:
 @click.option("--store", help="Store that all processes use: s3://BUCKET/PREFIX or file:///FOLDER.")
 def coordinator(**given: Any) -> None:
     """Run a coordinator without an API. Of several, one runs the jobs, and another takes over when it dies."""
+    from services.runtime.kernel_cache import require_kernel_cache
+
+    require_kernel_cache()
     from services.server import coordinate
     from services.settings import CoordinatorSettings
 
@@ -129,8 +134,10 @@ def worker(host: str | None, **given: Any) -> None:
     They wait until the scheduler can be reached, and join it again after it was away.
     """
     from services.cluster.worker import work
+    from services.runtime.kernel_cache import require_kernel_cache
     from services.settings import ClusterSettings
 
+    require_kernel_cache()
     work(ClusterSettings(**drop_unset(given)), host)
 
 

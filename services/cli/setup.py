@@ -35,6 +35,9 @@ def warm(as_json: bool) -> None:
     or else beside the source, or else, where that can't be written, in the user's cache folder. They fit this machine's
     kind of processor, and this version of envmatte.
     """
+    from services.runtime.kernel_cache import require_kernel_cache
+
+    require_kernel_cache()
     from workflows.kernels import compile_kernels
 
     with Progress("warm") as bar:
