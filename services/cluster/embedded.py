@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 from distributed import LocalCluster
 
@@ -10,6 +10,7 @@ from services.cluster.dask_config import SCHEDULER
 from services.cluster.forkserver import PRELOAD, START, start_forkserver
 from services.cluster.nanny import Nanny
 from services.runtime import certificates
+from services.runtime.signals import held_signals
 from services.settings import CoordinatorSettings
 
 IDLE = 300.0
@@ -24,22 +25,26 @@ def embedded(settings: CoordinatorSettings) -> Iterator[LocalCluster]:
     that only they have: other users of the machine can't join.
     """
     start_forkserver(PRELOAD)
-    with LocalCluster(
-        n_workers=settings.workers,
-        threads_per_worker=1,
-        processes=True,
-        host="127.0.0.1",
-        protocol="tls://",
-        security=certificates.new_security(),
-        dashboard_address=None,
-        scheduler_kwargs=SCHEDULER,
-        local_directory=str(settings.data.resolve() / "scratch"),
-        memory_limit=settings.worker_memory,
-        silence_logs=30,
-        death_timeout=f"{START} s",
-        preload=PRELOAD,
-        worker_class=Nanny,
-    ) as cluster:
+    with ExitStack() as stack:
+        with held_signals():
+            cluster = stack.enter_context(
+                LocalCluster(
+                    n_workers=settings.workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    protocol="tls://",
+                    security=certificates.new_security(),
+                    dashboard_address=None,
+                    scheduler_kwargs=SCHEDULER,
+                    local_directory=str(settings.data.resolve() / "scratch"),
+                    memory_limit=settings.worker_memory,
+                    silence_logs=30,
+                    death_timeout=f"{START} s",
+                    preload=PRELOAD,
+                    worker_class=Nanny,
+                )
+            )
         yield cluster
 
 

@@ -7,7 +7,9 @@ import signal
 import sys
 import threading
 import time
-from contextlib import AbstractAsyncContextManager, suppress
+from collections.abc import Iterator
+from contextlib import AbstractAsyncContextManager, contextmanager, suppress
+from typing import Any
 
 import psutil
 
@@ -49,6 +51,30 @@ def exit_on_signal() -> None:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, end)
+
+
+@contextmanager
+def held_signals() -> Iterator[None]:
+    """Put a first SIGTERM or SIGINT off until what starts here has started: half of it could not be closed in order."""
+    held: list[int] = []
+
+    def hold(number: int, frame: object) -> None:
+        if held:
+            handlers[number](number, frame)
+        held.append(number)
+
+    handlers: dict[int, Any] = {
+        number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)
+    }
+    for number in handlers:
+        signal.signal(number, hold)
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for number in held:
+        signal.raise_signal(number)
 
 
 def run_until_signal(service: AbstractAsyncContextManager[object]) -> None:

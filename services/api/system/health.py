@@ -77,7 +77,7 @@ class Check:
             unsaid = f"{type(error).__name__}; the log of the service has more"
             found = error.detail if isinstance(error, EnvmatteError) else unsaid
             if found != self._last:
-                logger.warning("not ready: %s", found, exc_info=True)
+                logger.warning("not ready: %s", found, exc_info=not isinstance(error, EnvmatteError))
             return found
 
 

@@ -44,20 +44,19 @@ def test_workers_do_not_run_the_code_of_the_working_directory(tmp_path: Path) ->
         process.wait(60)
 
 
+def test_ctrl_c_while_the_cluster_starts_ends_it_without_tracebacks(tmp_path: Path) -> None:
+    options = ["--data", str(tmp_path), "--port", "0", "--workers", "1"]
+    with running([sys.executable, "-m", "services", "serve", *options], start_new_session=True) as process:
+        until(lambda: (tmp_path / "scratch").exists())  # the cluster makes it
+        os.killpg(process.pid, signal.SIGINT)
+        _, log = process.communicate(timeout=120)
+    assert (process.returncode, "Interrupted." in log, "Traceback" in log) == (130, True, False), log
+
+
 @pytest.mark.parametrize("replaced", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ctrl_c_in_a_terminal_ends_a_service_without_tracebacks(tmp_path: Path, replaced: bool) -> None:
-    serve = [
-        sys.executable,
-        "-m",
-        "services",
-        "serve",
-        "--data",
-        str(tmp_path),
-        "--port",
-        "0",
-        "--workers",
-        "1",
-    ]
+    options = ["--data", str(tmp_path), "--port", "0", "--workers", "1"]
+    serve = [sys.executable, "-m", "services", "serve", *options]
     with running(serve, start_new_session=True) as process:
         assert process.stdout is not None
         assert " at http" in process.stdout.readline()
