@@ -51,6 +51,8 @@ from workflows.untrusted.limits import Limits
 WIDTH, HEIGHT = 16, 12
 MONITOR = 256, 192
 LIMITS = Limits(unpacked=1 << 28, memory=1 << 26)
+LOOK = 0.5
+"""Seconds after which the kernels that are there are counted again."""
 
 
 class Compiled(NamedTuple):
@@ -59,7 +61,7 @@ class Compiled(NamedTuple):
     Attributes
     ----------
     kernels : int
-        All kernels.
+        All kernels, without those that are a part of what calls them.
     compiled : int
         How many types of calls were compiled, because the cache lacked them.
     cache : Path
@@ -82,14 +84,14 @@ def compile_kernels(progress: Callable[[float, str], None] = lambda share, what:
     progress : callable, optional
         Is called with the share that is done, 0 to 1, and what is under way.
     """
-    start = time.perf_counter()
+    start, began = time.perf_counter(), time.time()
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(CORES, len(PARTS)), context) as pool:
         left = {pool.submit(_compile, part): part for part in PARTS}
         misses = 0
         while left:
-            progress(1 - len(left) / len(PARTS), ", ".join(left.values()))
-            done, _ = wait(left, return_when=FIRST_COMPLETED)
+            progress(min(_written_since(began) / len(find_kernels()), 0.99), ", ".join(left.values()))
+            done, _ = wait(left, LOOK, FIRST_COMPLETED)
             for future in done:
                 misses += future.result()
                 del left[future]
@@ -98,15 +100,21 @@ def compile_kernels(progress: Callable[[float, str], None] = lambda share, what:
 
 
 def find_kernels() -> list[CPUDispatcher]:
-    """All kernels of the modules that are imported."""
+    """All kernels of the modules that are imported, without those that are inlined: they have no entry in the cache."""
     modules = [module for name, module in sys.modules.items() if name.startswith(f"{__package__}.")]
     found = (value for module in modules for value in vars(module).values())
-    return list({id(value): value for value in found if isinstance(value, CPUDispatcher)}.values())
+    kernels = (value for value in found if isinstance(value, CPUDispatcher))
+    return list({id(one): one for one in kernels if one.targetoptions.get("inline") != "always"}.values())
 
 
 def cache_folder() -> Path:
     """The folder in which numba keeps compiled kernels: that of ``NUMBA_CACHE_DIR``, the source's or the user's."""
     return Path(os.path.commonpath([kernel.stats.cache_path for kernel in find_kernels()]))
+
+
+def _written_since(began: float) -> int:
+    """How many kernels the cache has got since a time."""
+    return sum(file.stat().st_mtime >= began for file in cache_folder().rglob("*.nbi"))
 
 
 def _compile(part: str) -> int:

@@ -44,7 +44,7 @@ def warm(as_json: bool) -> None:
         done = compile_kernels(bar.show)
     result = {"cache": str(done.cache), "kernels": done.kernels, "compiled": done.compiled}
     result["seconds"] = round(done.seconds, 1)
-    summary = f"{done.kernels} kernels in {done.cache}, {done.compiled} compiled in {done.seconds:.1f} s"
+    summary = f"{done.compiled} kernels compiled in {done.seconds:.1f} s, kept in {done.cache}"
     click.echo(json.dumps(result, indent=2) if as_json else summary)
 
 

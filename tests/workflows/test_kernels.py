@@ -1,13 +1,16 @@
 """Kernels are compiled ahead of time: after `compile_kernels` no job and no request compiles any."""
 
 import json
+import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from workflows import kernels
 from workflows.kernels import find_kernels
 
 USE = """
@@ -43,11 +46,7 @@ name = lambda kernel: f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
 print(json.dumps({
     "kernels": len(found),
     "compiled": [name(kernel) for kernel in found if kernel.stats.cache_misses],
-    # Those that are inlined become a part of what calls them, and have no entry of their own.
-    "lacking": [
-        name(kernel) for kernel in found
-        if kernel.targetoptions.get("inline") != "always" and not kernel._cache._cache_file._load_index()
-    ],
+    "lacking": [name(kernel) for kernel in found if not kernel._cache._cache_file._load_index()],
 }))
 """
 
@@ -67,11 +66,21 @@ def test_after_warm_nothing_is_compiled(tmp_path: Path) -> None:
     assert used == {"kernels": warmed["kernels"], "compiled": [], "lacking": []}
 
 
+def test_progress_counts_kernels_that_were_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels, "cache_folder", lambda: tmp_path)
+    for n, age in enumerate((100, 0, 0)):
+        (tmp_path / f"{n}").mkdir()
+        file = tmp_path / f"{n}" / "kernel.nbi"
+        file.touch()
+        os.utime(file, (time.time() - age,) * 2)
+    assert kernels._written_since(time.time() - 50) == 2
+
+
 def test_every_kernel_releases_the_interpreter_lock() -> None:
     """Else a request that computes would stop the event loop, and with it all others."""
-    kernels = find_kernels()
-    assert len(kernels) > 50
-    assert not [kernel.py_func.__name__ for kernel in kernels if not kernel.targetoptions.get("nogil")]
+    found = find_kernels()
+    assert len(found) > 50
+    assert not [kernel.py_func.__name__ for kernel in found if not kernel.targetoptions.get("nogil")]
 
 
 @pytest.mark.parametrize("named", [True, pytest.param(False, marks=pytest.mark.slow)])
