@@ -40,6 +40,12 @@ function open(hash) {
 	return view;
 }
 
+// Waits until the service, which was away, answers again.
+async function returned(signal) {
+	do await pause(RETRY, signal);
+	while (!(await fetch("healthz", { signal }).catch(() => null))?.ok);
+}
+
 async function route(navigated) {
 	// What follows a question mark is the view's own.
 	const [, hash, name = "home", id] = /^(#\/(?:(\w+)(?:\/([\w-]+))?)?)(?:\?.*)?$/.exec(location.hash) ?? [];
@@ -61,7 +67,7 @@ async function route(navigated) {
 		const final = error.status >= 400 && error.status < 500 && error.status !== 401;
 		const again = !final && h("p", h("button", { type: "button", onclick: () => route(true) }, t("again")));
 		if (!view.signal.aborted) view.element.append(problemBox(error), again || "");
-		if (error.status === 0) pause(RETRY, view.signal).then(() => route(false), () => {}); // the service was away
+		if (error.status === 0) returned(view.signal).then(() => route(false), () => {}); // the user left the view
 	}
 	if (view !== shown) return;
 	main.ariaBusy = "false";
