@@ -61,7 +61,7 @@ class Compiled(NamedTuple):
     Attributes
     ----------
     kernels : int
-        All kernels, without those that are a part of what calls them.
+        All kernels.
     compiled : int
         How many types of calls were compiled, because the cache lacked them.
     cache : Path
@@ -85,12 +85,14 @@ def compile_kernels(progress: Callable[[float, str], None] = lambda share, what:
         Is called with the share that is done, 0 to 1, and what is under way.
     """
     start, began = time.perf_counter(), time.time()
+    # Those that are inlined become a part of what calls them, and have no entry of their own.
+    entries = sum(kernel.targetoptions.get("inline") != "always" for kernel in find_kernels())
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(CORES, len(PARTS)), context) as pool:
         left = {pool.submit(_compile, part): part for part in PARTS}
         misses = 0
         while left:
-            progress(min(_written_since(began) / len(find_kernels()), 0.99), ", ".join(left.values()))
+            progress(min(_written_since(began) / entries, 0.99), ", ".join(left.values()))
             done, _ = wait(left, LOOK, FIRST_COMPLETED)
             for future in done:
                 misses += future.result()
@@ -100,11 +102,10 @@ def compile_kernels(progress: Callable[[float, str], None] = lambda share, what:
 
 
 def find_kernels() -> list[CPUDispatcher]:
-    """All kernels of the modules that are imported, without those that are inlined: they have no entry in the cache."""
+    """All kernels of the modules that are imported."""
     modules = [module for name, module in sys.modules.items() if name.startswith(f"{__package__}.")]
     found = (value for module in modules for value in vars(module).values())
-    kernels = (value for value in found if isinstance(value, CPUDispatcher))
-    return list({id(one): one for one in kernels if one.targetoptions.get("inline") != "always"}.values())
+    return list({id(value): value for value in found if isinstance(value, CPUDispatcher)}.values())
 
 
 def cache_folder() -> Path:

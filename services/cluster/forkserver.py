@@ -49,8 +49,8 @@ def ensure_running() -> None:
     order: the fork server and all workers inherit that it is blocked, from their first moment on.
     """
     resource_tracker.ensure_running()  # it unblocks the signal where it starts
-    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         forkserver.ensure_running()
     finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

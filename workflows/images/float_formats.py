@@ -65,8 +65,11 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
     ImageError
         If it is damaged, too large, or of an unsupported kind.
     """
-    readers = {EXR: ("EXR", _exr), HDR: ("HDR", _hdr)}
-    kind, read = next((reader for mark, reader in readers.items() if data.startswith(mark)), ("TIFF", _tiff))
+    kind, read = "TIFF", _tiff
+    if data.startswith(EXR):
+        kind, read = "EXR", _exr
+    elif data.startswith(HDR):
+        kind, read = "HDR", _hdr
     try:
         pixels = read(data, memory)
     except ImageError:

@@ -85,10 +85,11 @@ def find_tone_mapping(
         for way in ways
     ]
     (power, error, _), width, near = min(by_way, key=lambda one: one[0].error)
-    if power + (known["power"] if known else 0.0) > MOST:
+    total = power + (known["power"] if known else 0.0)
+    if total > MOST:
         return None
     if known:
-        return known | {"power": max(known["power"] + power, 0.0)}
+        return known | {"power": max(total, 0.0)}
     if power < max(SURE * error, LEAST):
         return None
     spread = float(near.at(*sample.places).std())

@@ -49,7 +49,7 @@ export async function home(main, signal) {
 	// A file is no choice before it is chosen: then a radio button that nobody sees marks it.
 	const isOwn = h("input", { type: "radio", name: "backdrop", hidden: true });
 	const frame = h("span.frame", fileSymbol());
-	backdrops.push(h("label.thumb-choice", fileField({ accept: "image/*", title: "" }, (files) => take(files)), isOwn, frame, h("span", t("page.own"))));
+	backdrops.push(h("label.thumb-choice", fileField({ accept: "image/*", title: "" }, take), isOwn, frame, h("span", t("page.own"))));
 	const glasses = samples.map((sample, i) =>
 		choice("sample", titleOf(sample), h("img", { src: still(sample), alt: "", width: 96, height: 72, draggable: "false" }), i === 0, () => show(sample)));
 
