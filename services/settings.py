@@ -159,7 +159,9 @@ class CoordinatorSettings(ClusterSettings):
         ge=1 << 20,
     )
     unpacked_bytes: int = _setting(64 << 30, "Bytes that a capture archive may unpack to.", ge=1)
-    capture_frames: int = _setting(MAX_FRAMES, "Frames of a capture, at most.", ge=1, le=MAX_FRAMES)
+    capture_frames: int = _setting(
+        MAX_FRAMES, "Frames, or patterns, of a capture, at most.", ge=1, le=MAX_FRAMES
+    )
     capture_pixels: int = _setting(100_000_000, "Pixels of a frame, at most.", ge=1)
     job_seconds: int | None = _setting(
         None,

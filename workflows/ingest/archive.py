@@ -127,7 +127,8 @@ class CaptureArchive:
         if manifest.video is None and not manifest.frames:
             raise CaptureError(f"{MANIFEST} names no frames", entry=MANIFEST, field="frames")
         count = manifest.program.count
-        self._limits.check_frames(len(manifest.frames) or count, entry=MANIFEST, field="frames")
+        # Recovery takes memory for every pattern, whether an unfinished capture has a frame of it or not.
+        self._limits.check_frames(max(len(manifest.frames), count), entry=MANIFEST, field="frames")
         self._check_files_exist()
         for n, frame in enumerate(manifest.frames):
             if frame.pattern >= count:

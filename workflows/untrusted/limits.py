@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from storage.errors import ImageError, OverLimit
 
 MAX_FRAMES = 20_000
-"""Frames of a capture, whatever is allowed."""
+"""Frames, or patterns, of a capture, whatever is allowed."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Limits:
     memory : int
         Bytes that one reader may hold. An entry, or a decoded image, may take a quarter of it.
     frames, pixels : int, optional
-        Frames of a capture, and pixels of a frame; None sets no limit of its own.
+        Frames, or patterns, of a capture, and pixels of a frame; None sets no limit of its own.
     """
 
     unpacked: int
@@ -34,7 +34,7 @@ class Limits:
         return self.memory // 4
 
     def check_frames(self, frames: int, **where: str) -> None:
-        """Check that a capture may have ``frames`` frames.
+        """Check that a capture may have ``frames`` frames, or patterns.
 
         Parameters
         ----------
@@ -47,7 +47,7 @@ class Limits:
         """
         if self.frames is not None and frames > self.frames:
             raise OverLimit(
-                f"a capture may have {self.frames} frames, this one has {frames}; leave some out",
+                f"a capture may have {self.frames} frames or patterns, this one has {frames}; leave some out",
                 **where,
                 name="capture_frames",
                 limit=self.frames,

@@ -8,12 +8,13 @@ import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from storage.errors import CaptureError
+from storage.errors import CaptureError, OverLimit
 from storage.layout import uploads
 from storage.objects.store import Objects
 from workflows.ingest.archive import MAX_ENTRIES, CaptureArchive
@@ -90,6 +91,14 @@ def test_archive_is_read(make_zip: Zip, pack: int) -> None:
 def test_patterns_of_an_unfinished_capture_may_lack_frames(make_zip: Zip) -> None:
     record = changed(lambda r: r.update(frames=r["frames"][:3], unfinished=True))
     assert [frame.pattern for frame in open_archive(make_zip(record, FILES)).manifest.frames] == [2, 0, 1]
+
+
+def test_an_unfinished_capture_may_have_no_more_patterns_than_frames(make_zip: Zip) -> None:
+    record = changed(lambda r: r.update(frames=r["frames"][:3], unfinished=True))
+    data = make_zip(record, FILES)
+    assert open_archive(data, replace(LIMITS, frames=5)).manifest.program.count == 5
+    with pytest.raises(OverLimit, match="may have 4 frames or patterns, this one has 5"):
+        open_archive(data, replace(LIMITS, frames=4))
 
 
 def test_unknown_fields_and_files_are_accepted(make_zip: Zip) -> None:

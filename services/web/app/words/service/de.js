@@ -65,7 +65,7 @@ export const de = {
 	"`apart` recovers one T per channel, as in the paper; `joint` recovers one T for all three, their measurements weighted by inverse variance, for glass without dispersion.": "`apart` berechnet ein T je Kanal, wie in der Veröffentlichung; `joint` eines für alle drei, die Messungen mit der inversen Varianz gewichtet, für Glas ohne Dispersion.",
 	"`gaussian` fits oriented Gaussians to the clusters of T and filters T by them (Sect. 4.2.2); `none` does not.": "`gaussian` passt ausgerichtete Gauß-Keulen an die Cluster von T an und filtert T damit (Abschnitt 4.2.2); `none` nicht.",
 	"`hierarchical` goes from coarse to fine grids, and only the children of a level's cells are unknowns on the next (Sect. 4.2.3); `direct` solves for all cells of the finest level at once and is much slower.": "`hierarchical` geht von groben zu feinen Gittern, und nur die Kinder der Zellen einer Stufe sind Unbekannte der nächsten (Abschnitt 4.2.3); `direct` löst für alle Zellen der feinsten Stufe auf einmal und ist viel langsamer.",
-	"a capture may have {limit} frames, this one has {frames}; leave some out": "eine Aufnahme darf {limit} Bilder haben, diese hat {frames}; einige weglassen",
+	"a capture may have {limit} frames or patterns, this one has {frames}; leave some out": "eine Aufnahme darf {limit} Bilder oder Muster haben, diese hat {frames}; einige weglassen",
 	"a frame may have {limit} pixels, these have {size}; make them smaller": "ein Bild darf {limit} Pixel haben, diese haben {size}; verkleinern",
 	"a gamma of {gamma}": "ein Gamma von {gamma}",
 	"a grey camera sees no colours": "eine graue Kamera sieht keine Farben",
