@@ -26,7 +26,7 @@ from workflows.ingest.trial.steadiness import find_steadiness
 from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.frame_means import Share
-from workflows.ingest.video.matching import MAX_PATTERNS, MatchedFrames, match_frames
+from workflows.ingest.video.matching import MAX_MATCHED, MatchedFrames, match_frames
 from workflows.ingest.video.resemblance import lay_out
 from workflows.jobs import Steps, Task
 from workflows.programs.program import Images
@@ -158,12 +158,12 @@ def _examine(
         return shape, stills.storage_of(decoder, archive, first), None
     program, video = manifest.program, manifest.video
     entry = video.file
-    if program.count > MAX_PATTERNS:
+    if program.count > MAX_MATCHED:
         raise CaptureError(
-            f"{entry} shows {program.count} patterns, more than the {MAX_PATTERNS} that are found in a video: "
+            f"{entry} shows {program.count} patterns, more than the {MAX_MATCHED} that are found in a video: "
             "upload frames, or show fewer patterns",
             entry=entry,
-            limit=MAX_PATTERNS,
+            limit=MAX_MATCHED,
         )
     curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
     light = lay_out(program, curve, patterns)

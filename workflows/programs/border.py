@@ -33,7 +33,7 @@ from storage.errors import OptionError
 from workflows.programs.parts import Record
 
 BITS = 12
-MAX_PATTERNS = 2**BITS - 1
+MAX_NUMBERED = 2**BITS - 1
 """Patterns that can be numbered: code 0 marks the lead-in and the lead-out."""
 TICKS = 8
 """How often the tick is repeated along each side."""
@@ -168,10 +168,10 @@ def schedule(count: int, rate: float) -> list[Step]:
     OptionError
         If there are more patterns than can be numbered.
     """
-    if count > MAX_PATTERNS:
+    if count > MAX_NUMBERED:
         raise OptionError(
-            f"{count} patterns: a film may have {MAX_PATTERNS}; show the rest in another one",
-            limit=MAX_PATTERNS,
+            f"{count} patterns: a film may have {MAX_NUMBERED}; show the rest in another one",
+            limit=MAX_NUMBERED,
         )
     end = sum(LEAD_SECONDS)
     patterns = [Step(end + n / rate, 1 / rate, n) for n in range(count)]

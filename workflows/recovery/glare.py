@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.pyramid import Grids, Pyramid, halve_codes
+from workflows.recovery.pyramid import Grids, Pyramid, bump_variance, halve_codes
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import LEAST_WEIGHT, Transport
 
@@ -62,8 +62,7 @@ def spread_patterns(patterns: Patterns) -> list[Spread]:
         while level < len(pyramid.grids) - 1 and 2 ** (level + 1) <= sigma / 2:
             level += 1
         light = _light_of(patterns, level)
-        bump = 1 / 12 + (4**level - 1) / 4  # the variance of what a node is a mean of
-        blur = np.sqrt(max(sigma**2 - bump, 0.0)) / 2**level
+        blur = np.sqrt(max(sigma**2 - bump_variance(level), 0.0)) / 2**level
         # Beside the monitor there is no light, and a white monitor is 1 everywhere.
         inside = gaussian_filter(np.ones(light.shape[:2], np.float32), blur, mode="constant")[..., np.newaxis]
         blurred = gaussian_filter(light, (blur, blur, 0), mode="constant")
@@ -267,7 +266,7 @@ def _add_to_rows(
             while level < columns.size - 1 and minor >= 2 * _RESOLUTION * 2.0**level:
                 level += 1
             spacing = 2.0**level
-            blur = 1 / 12 + (4.0**level - 1) / 4  # the variance of the nodes' own bumps
+            blur = bump_variance(level)
             xx, yy = max(xx - blur, 0.3 * spacing**2), max(yy - blur, 0.3 * spacing**2)
             area = max(xx * yy - xy**2, 0.01 * xx * yy)
             left = max(math.floor((mx - math.sqrt(_REACH * xx)) / spacing), 0)

@@ -6,14 +6,12 @@ from workflows.simulation.optics import Doubles
 from workflows.simulation.solids import Convex, Solid, turned
 
 
-def lens(thickness: float = 0.3, turn: Doubles | None = None) -> Solid:
+def lens(thickness: float = 0.3) -> Solid:
     """A lens of diameter 2 that is as thick in its middle, between two spheres; its axis is z."""
     radius = (1 + thickness**2 / 4) / thickness
     apart = radius - thickness / 2
     centres = np.array([[0.0, 0.0, -apart], [0.0, 0.0, apart]])
-    return Solid(
-        Convex(centres=centres, axes=np.full((2, 3), radius)), turn=np.eye(3) if turn is None else turn
-    )
+    return Solid(Convex(centres=centres, axes=np.full((2, 3), radius)))
 
 
 def tumbler() -> Solid:

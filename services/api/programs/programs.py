@@ -19,7 +19,7 @@ from storage.database.rows import page
 from storage.database.tables import programs as table
 from storage.errors import OptionError
 from storage.records import programs
-from workflows.programs.border import MAX_PATTERNS, Border
+from workflows.programs.border import MAX_NUMBERED, Border
 from workflows.programs.files import fit_to_screen, program_json
 from workflows.programs.parts import Monitor
 from workflows.programs.preset_names import PRESETS
@@ -87,7 +87,7 @@ class PlaybackState(BaseModel):
     phase: Literal["countdown", "showing", "shown", "stopped"]
     patterns_per_second: float = Field(ge=0.01, le=120)
     seconds: float = Field(0, ge=0, le=3600, description="Until the first pattern.")
-    shown: int = Field(0, ge=0, le=MAX_PATTERNS, description="Number of patterns that have been shown.")
+    shown: int = Field(0, ge=0, le=MAX_NUMBERED, description="Number of patterns that have been shown.")
     border: Size | None = Field(
         None,
         description="The display's pixels, once they are known: they complete the capture.json of a film.",
@@ -233,7 +233,7 @@ def get_record(context: OwnerContext, id: str) -> dict[str, Any]:
 def _check_size(program: PatternProgram) -> None:
     pixels = program.monitor.width * program.monitor.height
     for value, what, limit in (
-        (program.count, "patterns", MAX_PATTERNS),
+        (program.count, "patterns", MAX_NUMBERED),
         (pixels, "pixels of the monitor", MAX_PIXELS),
         (pixels * program.count, "pixels of all patterns together", MAX_TOTAL_PIXELS),
     ):

@@ -16,7 +16,7 @@ from tests.end_to_end.conftest import Service, serving
 from tests.parts.waiting import until
 from workflows.programs.border import (
     LEAD,
-    MAX_PATTERNS,
+    MAX_NUMBERED,
     Border,
     draw_border,
     number_cells,
@@ -38,7 +38,7 @@ SHORT = {
     ],
 }
 DISPLAYS = [(640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121), (90, 60), (200, 5000)]
-NUMBERS = [LEAD, 0, 1, 62, 63, 64, 1023, MAX_PATTERNS - 1]
+NUMBERS = [LEAD, 0, 1, 62, 63, 64, 1023, MAX_NUMBERED - 1]
 
 
 def posted(service: Service, **changes: Any) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from storage.errors import OptionError
 from workflows.programs.border import (
     BITS,
     LEAD,
-    MAX_PATTERNS,
+    MAX_NUMBERED,
     Border,
     Box,
     Step,
@@ -28,7 +28,7 @@ DISPLAY = Border(width=640, height=360)
 DISPLAYS = [
     Border(width=w, height=h) for w, h in ((640, 360), (1920, 1080), (1080, 1920), (3440, 1440), (161, 121))
 ]
-NUMBERS = [LEAD, 0, 1, 2, 3, 62, 63, 64, 131, 431, 1023, 2047, MAX_PATTERNS - 1]
+NUMBERS = [LEAD, 0, 1, 2, 3, 62, 63, 64, 131, 431, 1023, 2047, MAX_NUMBERED - 1]
 
 
 def shown(number: int, border: Border = DISPLAY) -> NDArray[np.float64]:
@@ -74,7 +74,7 @@ def test_where_no_border_fits_is_said(width: int, height: int) -> None:
 
 
 def test_codes_are_all_different_and_neighbours_differ_in_one_bit_and_the_parity() -> None:
-    codes = np.array([number_cells(number) for number in range(LEAD, MAX_PATTERNS)])
+    codes = np.array([number_cells(number) for number in range(LEAD, MAX_NUMBERED)])
     assert codes.shape == (2**BITS, 2 * (BITS + 1))
     assert len(np.unique(codes, axis=0)) == 2**BITS
     np.testing.assert_array_equal(codes[:, ::2], ~codes[:, 1::2])
@@ -83,7 +83,7 @@ def test_codes_are_all_different_and_neighbours_differ_in_one_bit_and_the_parity
     assert changed[:, -1].all()
     assert [bool(tick_cells(number)[0]) for number in range(LEAD, 3)] == [False, True, False, True]
     number, certain = read_numbers(codes.astype(float))
-    np.testing.assert_array_equal(number, np.arange(LEAD, MAX_PATTERNS))
+    np.testing.assert_array_equal(number, np.arange(LEAD, MAX_NUMBERED))
     assert certain.all()
 
 
@@ -207,9 +207,9 @@ def test_schedule_has_a_lead_in_equal_times_and_a_lead_out() -> None:
 
 
 def test_more_patterns_than_numbers_are_refused() -> None:
-    assert schedule(MAX_PATTERNS, 2)[-6].number == MAX_PATTERNS - 1
+    assert schedule(MAX_NUMBERED, 2)[-6].number == MAX_NUMBERED - 1
     with pytest.raises(OptionError, match=r"4096 patterns.*4095"):
-        schedule(MAX_PATTERNS + 1, 2)
+        schedule(MAX_NUMBERED + 1, 2)
 
 
 def test_any_mixture_of_cells_is_a_sum_of_the_rows_of_border_light() -> None:

@@ -118,10 +118,10 @@ def _fitted(matte: Matte) -> dict[str, Any]:
     }
 
 
-def bytes_of_live(matte: Matte, lookups: int = LOOKUPS) -> int:
+def bytes_of_live(matte: Matte) -> int:
     """Bytes that `encode_live` takes, apart from a block for each thread: codes, planes of bytes, and their copies."""
     pixels = -(-matte.width // _step(matte)) * -(-matte.height // _step(matte))
-    return pixels * (9 * lookups + 25 + 3 * (_PLANES * lookups + 7) + 12)
+    return pixels * (9 * LOOKUPS + 25 + 3 * (_PLANES * LOOKUPS + 7) + 12)
 
 
 def _step(matte: Matte) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from storage.layout.mattes import Block, Matte
 from workflows.interruption import checkpoint
-from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.pyramid import Pyramid, bump_variance
 
 FIELDS = ("x", "y", "level", "R", "G", "B")
 """The values of a lookup, in this order."""
@@ -167,7 +167,7 @@ def _read_clusters(
             cluster[4 + channel] = w
             w = cluster[4] + cluster[5] + cluster[6]
             cluster[0], cluster[1], cluster[2] = w, w * x, w * y
-            cluster[3] = w * ((x * x + y * y) / 2 + _variance(level))
+            cluster[3] = w * ((x * x + y * y) / 2 + bump_variance(level))
             key[n] = (level * 2**24 + (row >> halvings)) * 2**24 + (column >> halvings)
             n, entry = n + 1, entry + 1
     return n
@@ -270,19 +270,12 @@ def _cost(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 @njit(nogil=True, cache=True)
-def _variance(level: int) -> float:
-    """Variance of a bump along an axis, in cells squared."""
-    variance: float = 1 / 12 + (4.0**level - 1) / 4
-    return variance
-
-
-@njit(nogil=True, cache=True)
 def _variance_of_lookup(x: float, y: float, level: int) -> float:
     """Variance of a lookup at a position in cells, in cells squared, the mean of both axes."""
     side = 2.0**level
     f, g = x / side - 0.5, y / side - 0.5
     f, g = f - math.floor(f), g - math.floor(g)
-    variance: float = _variance(level) + side * side * (f * (1 - f) + g * (1 - g)) / 2
+    variance: float = bump_variance(level) + side * side * (f * (1 - f) + g * (1 - g)) / 2
     return variance
 
 

@@ -24,7 +24,7 @@ Doubles = NDArray[np.float64]
 Refusal = Callable[[str], CaptureError]
 """Makes the error to raise from what is wrong."""
 
-MAX_PATTERNS = 2000
+MAX_MATCHED = 2000
 """Patterns of a program that is filmed: matching takes memory in proportion to their square."""
 MIN_SHARE = 0.6
 """A recording with a smaller share of the patterns that are not constant is refusal."""

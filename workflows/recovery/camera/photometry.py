@@ -123,7 +123,6 @@ def estimate_noise(
     levels: NDArray[np.float32],
     usable: NDArray[np.bool_],
     quantum: float,
-    frames: NDArray[np.integer] | None = None,
 ) -> Noise:
     """Estimate the noise of a frame from the residuals of constant monitors' values to the line of eq. 6.
 
@@ -137,8 +136,6 @@ def estimate_noise(
         False where a value must be ignored, as where the camera clipped it.
     quantum : float
         Step between two stored values, in units of full scale.
-    frames : (k,) integer, optional
-        Frames averaged into each value. Default: 1.
 
     Returns
     -------
@@ -154,8 +151,8 @@ def estimate_noise(
     Notes
     -----
     The residuals of an unweighted line are ``R e``, R the projector onto the complement of lines. If the error e_j of
-    frame j has the variance ``(read + shot v_j) / frames_j``, residual i has the variance ``read a + shot b`` with
-    ``a = sum_j R_ij^2 / frames_j`` and ``b = sum_j R_ij^2 v_j / frames_j``. Residuals are binned by b / a. The trimmed
+    frame j has the variance ``read + shot v_j``, residual i has the variance ``read a + shot b`` with ``a = sum_j
+    R_ij^2`` and ``b = sum_j R_ij^2 v_j``. Residuals are binned by b / a. The trimmed
     mean of ``r^2 / a`` in a bin, without the largest tenth, divided by the trimmed mean of a chi-square variable, is a
     robust sample of ``read + shot (b / a)``. This line is fitted with both terms >= 0. (A median would fail where
     rounding leaves only a few different values.)
@@ -168,8 +165,7 @@ def estimate_noise(
     typical = Noise(TYPICAL_READ + floor, TYPICAL_SHOT)
     channels = range(3) if len(levels) >= 4 else ()
     step = max(1, -(-values.shape[0] // _SAMPLE))
-    share = 1 / (np.ones(len(levels)) if frames is None else frames)
-    found = [_residuals(values[::step, :, c], levels[:, c], usable[::step, :, c], share) for c in channels]
+    found = [_residuals(values[::step, :, c], levels[:, c], usable[::step, :, c]) for c in channels]
     level, square, unused = (
         np.concatenate([np.zeros(0), *arrays]) for arrays in (zip(*found, strict=True) if found else [()] * 3)
     )
@@ -281,7 +277,6 @@ def _residuals(
     values: NDArray[np.float32],
     levels: NDArray[np.float32],
     usable: NDArray[np.bool_],
-    share: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """b / a and r^2 / a of :func:`estimate_noise` for one channel, from values of shape (n, k).
 
@@ -299,8 +294,8 @@ def _residuals(
     slope = np.einsum("ni,ni->n", offset, data)[:, None] / spread
     fitted = (mask * (data - slope * levels)).sum(axis=1, keepdims=True) / count + slope * levels
     squared = (mask[:, :, None] * np.eye(len(levels)) - line) ** 2
-    a = squared @ share
-    b = np.einsum("nij,nj->ni", squared, fitted * share)
+    a = squared.sum(axis=2)
+    b = np.einsum("nij,nj->ni", squared, fitted)
     kept = (mask > 0) & (a > 1e-6)
     return b[kept] / a[kept], (data - fitted)[kept] ** 2 / a[kept], fitted[mask == 0]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from workflows.recovery.pyramid import Grids
+from workflows.recovery.pyramid import Grids, bump_variance
 
 PARAMETERS = 6
 """Parameters of a lobe."""
@@ -59,12 +59,6 @@ class PatternCodes(NamedTuple):
 def parts_of(patterns: PatternCodes) -> tuple[int, int]:
     """Into how many parts the groups fall that see lobes at the same places, and how many groups are in each."""
     return (patterns.groups, 1) if patterns.dispersed else (1, patterns.groups)
-
-
-@njit(nogil=True, cache=True)
-def bump_variance(level: int) -> float:
-    """Variance of the bumps of a level along an axis, in squared cells of the first grid."""
-    return 1 / 12 + (4.0**level - 1) / 4
 
 
 @njit(nogil=True, cache=True)

@@ -6,13 +6,12 @@ import pytest
 from workflows.recovery.lobes.footprint import (
     NODES,
     PARAMETERS,
-    bump_variance,
     combine,
     fit_level,
     sample,
     signed_codes,
 )
-from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.pyramid import Pyramid, bump_variance
 
 COLUMNS, ROWS = 128, 96
 PYRAMID = Pyramid.over(COLUMNS, ROWS)

@@ -9,7 +9,7 @@ from typing import IO
 from storage.layout.mattes import Matte
 from workflows.composite.backdrops.around import Plate
 from workflows.composite.live.nodes.nuke import Nodes
-from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.pyramid import Pyramid, bump_variance
 
 NAME = "envmatte_glass_stmap"
 """Of the group of nodes."""
@@ -61,9 +61,8 @@ def _size(level: int, side: str, cells: int) -> str:
 
     Notes
     -----
-    A cell of the first level is a box, of variance 1/12. The weights [1, 3, 3, 1] / 8 have the variance 3/4, in
-    spacings of the level before. Linear interpolation between nodes adds 1/6 of a squared spacing, on average over the
-    places. The backdrop's own pixels are boxes, too.
+    Linear interpolation between nodes adds 1/6 of a squared spacing to the variance of their bumps, on average over the
+    places. The backdrop's own pixels are boxes, of variance 1/12.
     """
-    variance = 1 / 12 + (4**level - 1) / 4 + 4**level / 6  # of squared cells of the first level
+    variance = bump_variance(level) + 4**level / 6  # of squared cells of the first level
     return f"{SIZE}*sqrt(max(pow(input.{side}/{cells},2)*{variance:.6g}-1/12.0,0))"

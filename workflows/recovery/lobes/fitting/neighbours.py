@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.fitting.fits import Fits, fit_of
-from workflows.recovery.lobes.footprint import PatternCodes, bump_variance, fit_level
+from workflows.recovery.lobes.footprint import PatternCodes, fit_level
 from workflows.recovery.lobes.mixture import (
     Mixture,
     Workspace,
@@ -22,6 +22,7 @@ from workflows.recovery.lobes.mixture import (
     without_derivatives,
 )
 from workflows.recovery.lobes.options import LobesOptions
+from workflows.recovery.pyramid import bump_variance
 
 MOST_REST = 1.7
 """Lobes are searched again where the squared residual is this many times that of the neighbours. Of 128 measurements,

@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from workflows.recovery.lobes.fitting.search import find_node, fit
-from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes, bump_variance
+from workflows.recovery.lobes.footprint import PARAMETERS, PatternCodes
 from workflows.recovery.lobes.mixture import Mixture, make_workspace
 from workflows.recovery.lobes.options import FINE, LobesOptions
+from workflows.recovery.pyramid import bump_variance
 
 COLUMNS, ROWS, MOST = 64, 48, 3
 SIGMA = 0.01
