@@ -1,6 +1,5 @@
 """`envmatte demo`: the whole way of a capture, from a glass ball to a composite, on this machine."""
 
-import ctypes
 import io
 import shutil
 import signal
@@ -10,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,11 @@ from workflows.images.tone_curves import from_light, to_light
 from workflows.programs.presets import preset
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
+from workflows.untrusted.confinement import end_with_parent
 
 WIDTH, HEIGHT = 240, 180
 PANEL = 480, 360
 ERROR_GAIN = 8
-PARENT_DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of prctl(2)."""
 
 
 def run(
@@ -117,7 +116,11 @@ def service(data: Path, workers: int | None) -> Iterator[str]:
         command += ["--workers", str(workers)]
     with (data.parent / "service.log").open("wb") as log:
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=log, text=True, preexec_fn=_end_with_parent
+            command,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            preexec_fn=partial(end_with_parent, signal.SIGTERM),
         )
         try:
             assert process.stdout is not None
@@ -128,12 +131,6 @@ def service(data: Path, workers: int | None) -> Iterator[str]:
         finally:
             process.terminate()
             process.wait(30)
-
-
-def _end_with_parent() -> None:
-    """Have this process, which was just forked, end by SIGTERM when its parent is killed, where that can be had."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM)
 
 
 def _side_by_side(panels: dict[str, NDArray[np.float32]]) -> bytes:
