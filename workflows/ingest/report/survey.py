@@ -3,7 +3,7 @@ monitor.
 """
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.camera.border_exposure import BorderValues, shortest_white
 from workflows.ingest.camera.calibration import constant_frames, is_free, measure
 from workflows.ingest.camera.lit import find_lit, windows
-from workflows.ingest.local_gain import Places, local_gain
+from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
 from workflows.ingest.report.colour_detail import ColourDetail
 from workflows.programs.program import Program
@@ -49,89 +49,140 @@ def survey(stack: Stack, border: BorderValues | None = None) -> None:
         measure(stack, border, stack.attributes["gains"], stack.attributes["tone_mapping"])
         if stack.attributes["noise_of_patterns"]:
             stack.annotate(noise=noise)
-    attributes = stack.attributes
-    program = Program.model_validate(attributes["program"])
-    look_up = look_up_of(stack)
-    patterns = np.array(attributes["patterns"])
-    frames, sent, times = constant_frames(stack, program)
-    level = sent.mean(axis=1) + np.where(times == times.min(), 0, np.nan)
-    white, black = frames[int(np.nanargmax(level))], frames[int(np.nanargmin(level))]
-    exposed = attributes["auto_exposure"]
-    if is_free(exposed):
-        shortest = shortest_white(np.array(exposed), attributes["patterns"], program)
-        white = white if shortest is None else shortest
-    noise = Noise(**attributes["noise"])
-    tones = [] if attributes["scaled"] else _halftone_frames(stack, program)
-    special = [black, white, *(frame for frame, _ in tones)]
-    chosen = np.union1d(np.linspace(0, stack.frames - 1, FRAMES).astype(int), special)
-    is_pattern = ~np.isin(patterns[chosen], program.constants[0])
-    coloured = []
-    if stack.channels == 3 and ("video" in attributes or attributes.get("half_colour")):
-        coloured = chosen[is_pattern][:: -(-np.count_nonzero(is_pattern) // COLOUR_FRAMES) or 1].tolist()
-    top = clipped_from(stack)
-
-    clipped = np.zeros((2, len(chosen)), np.int64)
-    ends = np.zeros((2, 2))
-    contrasts: list[NDArray[np.float32]] = []
-    deviations: list[NDArray[np.float32]] = []
-    brightest: list[NDArray[np.float32]] = []
-    lit = np.zeros((2, len(tones)))  # of half-tones times white, of white squared
-    detail, gain = ColourDetail(), local_gain(stack)
-    pixels, seen = 0, find_lit(stack, program)
-
-    def evened(codes: Codes, frame: int, y: Places, x: Places) -> NDArray[np.float32]:
-        light = even_out(light_of_codes(codes, look_up).mean(axis=2), frame, attributes)
-        return light if gain is None else light / gain.at(y, x, frame).reshape(light.shape)
-
+    program = Program.model_validate(stack.attributes["program"])
+    frames = _Frames.of(stack, program)
+    seen, found = find_lit(stack, program), _Windows(stack, frames)
     for rows, columns in windows(seen, EDGE):
         wanted = stack.mask(rows, columns) & seen[rows, columns]
-        if not wanted.any():
-            continue
+        if wanted.any():
+            found.add(rows, columns, wanted)
+    stack.annotate(survey=found.figures(program))
+
+
+class _Frames(NamedTuple):
+    """Which frames of a stack are examined.
+
+    Attributes
+    ----------
+    chosen : (n,) intp
+        Ascending; with the black, the white and the half-tones among them.
+    is_pattern : (n,) bool
+        Which of these are of patterns that are not constant.
+    black, white : int
+        The darkest and the brightest constant frame.
+    tones : list of (int, float)
+        As of `_halftone_frames`; none if the monitor scaled them.
+    coloured : list of int
+        From which the lost detail of colours is estimated.
+    """
+
+    chosen: NDArray[np.intp]
+    is_pattern: NDArray[np.bool_]
+    black: int
+    white: int
+    tones: list[tuple[int, float]]
+    coloured: list[int]
+
+    @classmethod
+    def of(cls, stack: Stack, program: Program) -> Self:
+        attributes = stack.attributes
+        frames, sent, times = constant_frames(stack, program)
+        level = sent.mean(axis=1) + np.where(times == times.min(), 0, np.nan)
+        white, black = frames[int(np.nanargmax(level))], frames[int(np.nanargmin(level))]
+        exposed = attributes["auto_exposure"]
+        if is_free(exposed):
+            shortest = shortest_white(np.array(exposed), attributes["patterns"], program)
+            white = white if shortest is None else shortest
+        tones = [] if attributes["scaled"] else _halftone_frames(stack, program)
+        special = [black, white, *(frame for frame, _ in tones)]
+        chosen = np.union1d(np.linspace(0, stack.frames - 1, FRAMES).astype(int), special)
+        is_pattern = ~np.isin(np.array(attributes["patterns"])[chosen], program.constants[0])
+        coloured = []
+        if stack.channels == 3 and ("video" in attributes or attributes.get("half_colour")):
+            step = -(-np.count_nonzero(is_pattern) // COLOUR_FRAMES) or 1
+            coloured = chosen[is_pattern][::step].tolist()
+        return cls(chosen, is_pattern, black, white, tones, coloured)
+
+
+class _Windows:
+    """What windows of the frames show, added up."""
+
+    def __init__(self, stack: Stack, frames: _Frames) -> None:
+        self._stack, self._frames = stack, frames
+        self._look_up, self._top, self._gain = look_up_of(stack), clipped_from(stack), local_gain(stack)
+        self._noise = Noise(**stack.attributes["noise"])
+        self._pixels = 0
+        self._clipped = np.zeros(
+            (2, len(frames.chosen)), np.int64
+        )  # at black and at full scale, of each frame,
+        self._ends = np.zeros((2, 2))  # and of the black and the white frame
+        self._contrasts: list[NDArray[np.float32]] = []
+        self._deviations: list[NDArray[np.float32]] = []
+        self._brightest: list[NDArray[np.float32]] = []
+        self._lit = np.zeros((2, len(frames.tones)))  # of half-tones times white, of white squared
+        self._detail = ColourDetail()
+
+    def add(self, rows: slice, columns: slice, wanted: NDArray[np.bool_]) -> None:
+        """Examine the wanted pixels of a window."""
+        black, white, tones, top = self._frames.black, self._frames.white, self._frames.tones, self._top
         y, x = np.mgrid[rows, columns].reshape(2, -1)
-        kept: dict[int, Codes] = {}
-        for at, codes in _batches(stack, rows, columns, chosen):
-            for end, there in enumerate((codes == 0, codes >= top)):
-                clipped[end, at] += (there.any(axis=3) & wanted).sum(axis=(1, 2))
-            found = dict(zip(chosen[at].tolist(), codes, strict=True))
-            kept |= {frame: found[frame].copy() for frame in (*special, *coloured) if frame in found}
-        codes_black, codes_white, *of_tones = (kept[frame] for frame in special)
-        B, W = (evened(codes, frame, y, x) for codes, frame in ((codes_black, black), (codes_white, white)))
-        pixels += int(np.count_nonzero(wanted))
-        ends[0] += [np.count_nonzero((c == 0).any(axis=2) & wanted) for c in (codes_black, codes_white)]
-        ends[1] += [np.count_nonzero((c >= top).any(axis=2) & wanted) for c in (codes_black, codes_white)]
-        contrasts.append((W - B)[wanted])
+
+        def evened(codes: Codes, frame: int) -> NDArray[np.float32]:
+            light = light_of_codes(codes, self._look_up).mean(axis=2)
+            light = even_out(light, frame, self._stack.attributes)
+            return light if self._gain is None else light / self._gain.at(y, x, frame).reshape(light.shape)
+
+        kept = self._read(rows, columns, wanted)
+        codes_black, codes_white = kept[black], kept[white]
+        B, W = evened(codes_black, black), evened(codes_white, white)
+        self._pixels += int(np.count_nonzero(wanted))
+        self._ends[0] += [np.count_nonzero((c == 0).any(axis=2) & wanted) for c in (codes_black, codes_white)]
+        self._ends[1] += [
+            np.count_nonzero((c >= top).any(axis=2) & wanted) for c in (codes_black, codes_white)
+        ]
+        self._contrasts.append((W - B)[wanted])
         whole = wanted & ((codes_black > 0) & (codes_white < top)).all(axis=2)
-        for of_tone, codes, (frame, _) in zip(lit.T, of_tones, tones, strict=True):
-            tone = evened(codes, frame, y, x)
+        for of_tone, (frame, _) in zip(self._lit.T, tones, strict=True):
+            tone = evened(kept[frame], frame)
             of_tone += [((light - B) * (W - B))[whole].sum(dtype=np.float64) for light in (tone, W)]
-        deviations.append(np.sqrt(noise.variance((B + W) / 2))[wanted])
-        brightest.append(light_of_codes(codes_white, look_up).max(axis=2)[wanted])
-        for frame in coloured:
-            detail.add(even_out(light_of_codes(kept[frame], look_up), frame, attributes)[np.newaxis], wanted)
-    contrast, middling, bright = (
-        _percentile(c, q) for c, q in ((contrasts, 50), (deviations, 50), (brightest, 99))
-    )
-    share = clipped / max(pixels, 1)
-    apart = lit[0] / np.maximum(lit[1], 1e-12) - [level for _, level in tones]
-    stack.annotate(
-        survey={
-            "pixels": pixels,
-            "black": {"clipped_low": ends[0, 0] / max(pixels, 1)},
-            "white": {
-                "clipped_high": ends[1, 1] / max(pixels, 1),
-                "reaches": bright,
-            },
-            "patterns": {
-                "clipped_low": float(share[0, is_pattern].mean()),
-                "clipped_high": float(share[1, is_pattern].mean()),
-            },
+        self._deviations.append(np.sqrt(self._noise.variance((B + W) / 2))[wanted])
+        self._brightest.append(light_of_codes(codes_white, self._look_up).max(axis=2)[wanted])
+        for frame in self._frames.coloured:
+            light = even_out(light_of_codes(kept[frame], self._look_up), frame, self._stack.attributes)
+            self._detail.add(light[np.newaxis], wanted)
+
+    def _read(self, rows: slice, columns: slice, wanted: NDArray[np.bool_]) -> dict[int, Codes]:
+        """Count what is clipped in all frames, and return those that are looked at further."""
+        chosen, tones = self._frames.chosen, [frame for frame, _ in self._frames.tones]
+        further = (self._frames.black, self._frames.white, *tones, *self._frames.coloured)
+        kept: dict[int, Codes] = {}
+        for at, codes in _batches(self._stack, rows, columns, chosen):
+            for end, there in enumerate((codes == 0, codes >= self._top)):
+                self._clipped[end, at] += (there.any(axis=3) & wanted).sum(axis=(1, 2))
+            found = dict(zip(chosen[at].tolist(), codes, strict=True))
+            kept |= {frame: found[frame].copy() for frame in further if frame in found}
+        return kept
+
+    def figures(self, program: Program) -> dict[str, Any]:
+        """What the report needs, as JSON."""
+        contrast, middling, bright = (
+            _percentile(values, q)
+            for values, q in ((self._contrasts, 50), (self._deviations, 50), (self._brightest, 99))
+        )
+        pixels = max(self._pixels, 1)
+        share = self._clipped[:, self._frames.is_pattern] / pixels
+        apart = self._lit[0] / np.maximum(self._lit[1], 1e-12) - [level for _, level in self._frames.tones]
+        return {
+            "pixels": self._pixels,
+            "black": {"clipped_low": self._ends[0, 0] / pixels},
+            "white": {"clipped_high": self._ends[1, 1] / pixels, "reaches": bright},
+            "patterns": {"clipped_low": float(share[0].mean()), "clipped_high": float(share[1].mean())},
             "contrast": contrast,
             "deviation": middling,
-            "lost_colour": detail.lost() * (COLOURED if program.in_colour else 1),
-            "grey": stack.channels == 1,
-            "halftones_apart": float(apart[np.argmax(np.abs(apart))]) if lit.any() else None,
+            "lost_colour": self._detail.lost() * (COLOURED if program.in_colour else 1),
+            "grey": self._stack.channels == 1,
+            "halftones_apart": float(apart[np.argmax(np.abs(apart))]) if self._lit.any() else None,
         }
-    )
 
 
 def _halftone_frames(stack: Stack, program: Program) -> list[tuple[int, float]]:
