@@ -124,8 +124,10 @@ def post(
         if not private and not is_public(address):
             raise Refused(f"{host} is at {address}, which is not public")
     deadline = time.monotonic() + seconds
-    connection = (http.client.HTTPSConnection if secure else http.client.HTTPConnection)(host, parts.port)
-    sock = _connect(addresses, connection.port, deadline)
+    # Without a port, http.client takes the end of an IPv6 address for one.
+    port = parts.port or (443 if secure else 80)
+    connection = (http.client.HTTPSConnection if secure else http.client.HTTPConnection)(host, port)
+    sock = _connect(addresses, port, deadline)
     timed_out, late = threading.Event(), TimeoutError(f"no complete answer within {seconds:g} s")
 
     def abort() -> None:  # the socket's own timeout starts again with every byte that comes

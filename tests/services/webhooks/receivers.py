@@ -1,5 +1,6 @@
 """Receivers of webhooks: small web servers that record what they get."""
 
+import socket
 import ssl
 import threading
 from collections.abc import Callable, Iterator
@@ -20,7 +21,7 @@ class Receiver:
 
 @contextmanager
 def receiver(
-    status: Callable[[int], int], certificate: Path | None = None, **headers: str
+    status: Callable[[int], int], certificate: Path | None = None, host: str = "127.0.0.1", **headers: str
 ) -> Iterator[Receiver]:
     """A receiver on a free port of loopback that answers request n with ``status(n)``; with a certificate, over TLS."""
     found = Receiver()
@@ -39,14 +40,19 @@ def receiver(
         def log_message(self, *arguments: object) -> None:
             pass
 
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+    class Server(ThreadingHTTPServer):
+        address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+
+    with Server((host, 0), Handler) as server:
         scheme = "http"
         if certificate:
             context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
             context.load_cert_chain(certificate)
             server.socket = context.wrap_socket(server.socket, server_side=True)
             scheme = "https"
-        found.url = f"{scheme}://127.0.0.1:{server.server_port}/webhook?by=envmatte"
+        found.url = (
+            f"{scheme}://{f'[{host}]' if ':' in host else host}:{server.server_port}/webhook?by=envmatte"
+        )
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:

@@ -12,7 +12,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.webhooks import safe_http
@@ -108,6 +108,15 @@ MALFORMED = [
 ]
 
 
+def _has_ipv6() -> bool:
+    with suppress(OSError), socket.create_server(("::1", 0), family=socket.AF_INET6):
+        return True
+    return False
+
+
+IPV6 = _has_ipv6()
+
+
 @pytest.mark.parametrize("address", PUBLIC)
 def test_address_is_public(address: str) -> None:
     assert safe_http.is_public(address)
@@ -176,6 +185,38 @@ def test_request_goes_to_the_address_that_was_checked(monkeypatch: pytest.Monkey
         assert safe_http.post(url, b"x", {}, private=True) == 200
     assert len(lookups) == 1
     assert found.received[0][0]["Host"].startswith("rebinding.example:")
+
+
+@given(
+    st.one_of(st.ip_addresses().map(str), st.just("localhost")),
+    st.sampled_from([("http", 80), ("https", 443)]),
+    st.none() | st.integers(1, 65535),
+)
+@settings(deadline=None)  # looking up a name may take long
+def test_request_goes_to_the_port_of_its_url_or_scheme(
+    host: str, scheme: tuple[str, int], port: int | None
+) -> None:
+    connections: list[tuple[str, int]] = []
+
+    def refuse(address: tuple[str, int], timeout: float) -> socket.socket:
+        connections.append(address)
+        raise ConnectionRefusedError
+
+    url = f"{scheme[0]}://{f'[{host}]' if ':' in host else host}{f':{port}' if port else ''}/"
+    safe_http.check_url(url, private=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(socket, "create_connection", refuse)
+        with pytest.raises(ConnectionRefusedError):
+            safe_http.post(url, b"x", {}, private=True)
+    assert {found for _, found in connections} == {port or scheme[1]}
+
+
+@pytest.mark.skipif(not IPV6, reason="this machine has no IPv6 loopback")
+def test_request_to_an_ipv6_address() -> None:
+    with receiver(lambda n: 200, host="::1") as found:
+        assert safe_http.post(found.url, b"x", {}, private=True) == 200
+    ((headers, body),) = found.received
+    assert (headers["Host"], body) == (found.url.split("/")[2], b"x")
 
 
 def test_redirect_is_not_followed() -> None:
