@@ -40,7 +40,9 @@ class App(FastAPI):
                 await send(message)
                 await send({"type": "http.response.body"})
 
-        await super().__call__({**scope, "method": "GET"}, receive, send_head)
+        # Range is for GET alone (RFC 9110, sect. 14.2).
+        headers = [(name, value) for name, value in scope["headers"] if name != b"range"]
+        await super().__call__({**scope, "method": "GET", "headers": headers}, receive, send_head)
 
     def openapi(self) -> dict[str, Any]:
         document = super().openapi()

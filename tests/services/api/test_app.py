@@ -47,3 +47,12 @@ def test_body_with_a_content_coding_is_refused(app: FastAPI, route: str) -> None
     assert answer.json()["field"] == "Content-Encoding"
     answer = client.post(f"/v1/{route}", content=b"{}", headers={"Content-Encoding": "Identity"})
     assert answer.json().get("field") != "Content-Encoding"
+
+
+def test_head_ignores_range(app: FastAPI) -> None:
+    client = TestClient(app, "http://127.0.0.1")
+    whole = client.get("/docs")
+    for asked in ("bytes=0-9", f"bytes={len(whole.content)}-"):
+        assert client.get("/docs", headers={"Range": asked}).status_code in (206, 416)
+        head = client.head("/docs", headers={"Range": asked})
+        assert (head.status_code, head.headers["content-length"]) == (200, str(len(whole.content)))
