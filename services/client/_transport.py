@@ -67,11 +67,8 @@ class Transport:
     def json(self, method: str, path: str, *, safe: bool = False, **request: Any) -> dict[str, Any]:
         """Send a request as `send` does; returns the JSON object of the answer."""
         answer = self.send(method, path, safe=safe, **request)
-        try:
-            found = answer.json()
-        except ValueError:
-            found = None
-        if not isinstance(found, dict):
+        found = _object(answer)
+        if found is None:
             raise self._foreign()
         return found
 
@@ -159,12 +156,23 @@ class Transport:
         return ServiceError({"title": "Another service", "status": 502, "detail": detail})
 
 
+def _object(answer: httpx2.Response) -> dict[str, Any] | None:
+    """The JSON object of an answer, None if it is something else."""
+    try:
+        found = answer.json()
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
 def _refusal(method: str, answer: httpx2.Response) -> ServiceError:
     kind = OF_STATUS.get(answer.status_code, ServiceError)
     retry_after = _seconds(answer.headers.get("retry-after", ""))
-    if answer.headers.get("content-type", "").startswith("application/problem+json") and answer.content:
-        return kind(answer.json(), retry_after)
-    # From a proxy, or in answer to HEAD.
+    if answer.headers.get("content-type", "").startswith("application/problem+json"):
+        found = _object(answer)
+        if found is not None:
+            return kind(found | {"status": answer.status_code}, retry_after)
+    # From a proxy, cut off, or in answer to HEAD.
     detail = f"{method} {answer.url} was answered with {answer.status_code} {answer.reason_phrase}"
     problem = {"title": answer.reason_phrase, "status": answer.status_code, "detail": detail}
     return kind(problem, retry_after)

@@ -37,6 +37,18 @@ def test_error_page_of_a_proxy_becomes_an_error() -> None:
     assert caught.value.problem["status"] == 502
 
 
+@pytest.mark.parametrize("body", [b'{"title": "x"', b"[1]", b"\xff", b'{"status": null}'])
+def test_malformed_problem_becomes_an_error(body: bytes) -> None:
+    answer = 422, {"Content-Type": "application/problem+json"}, body
+    with (
+        scripted_server(lambda n: answer) as (url, _),
+        Client(url) as client,
+        pytest.raises(ServiceError) as caught,
+    ):
+        client.recover("c")
+    assert caught.value.status == 422
+
+
 def test_computed_answers_are_waited_for_longer_than_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.client._transport.SILENCE", 0.2)
     given_up = threading.Event()
