@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import IO
 
@@ -19,6 +20,8 @@ from storage.disks import require_reserve
 
 MEMORY_BYTES = 1 << 18
 """The largest answer kept in memory while it is sent, and the size of the pieces read from a file."""
+VERSION = version("envmatte")
+"""Of this package: part of the entity tags of what its code computes, which an upgrade may change."""
 
 
 def bytes_response(data: bytes, media_type: str, headers: dict[str, str] | None = None) -> Response:

@@ -15,7 +15,7 @@ from services.api.http.bodies import BodyLimit, spool_body
 from services.api.http.errors import answer as answer_problem
 from services.api.http.idempotency import IdempotencyKey
 from services.api.http.media_types import preferred
-from services.api.http.responses import MEMORY_BYTES, bytes_response, etag_matches, file_response
+from services.api.http.responses import MEMORY_BYTES, VERSION, bytes_response, etag_matches, file_response
 from services.api.http.router import Router
 from services.api.http.server_timing import ServerTiming
 from services.api.jobs.jobs import Job
@@ -181,7 +181,9 @@ def _answer(
 ) -> Response:
     times = ServerTiming()
     body.seek(0)
-    inputs = f"{progress.id} {sorted(progress.blocks or ())} {media_type} {params.model_dump_json()} "
+    inputs = (
+        f"{VERSION} {progress.id} {sorted(progress.blocks or ())} {media_type} {params.model_dump_json()} "
+    )
     digest = hashlib.blake2b(inputs.encode(), digest_size=16)
     for piece in iter(partial(body.read, MEMORY_BYTES), b""):
         digest.update(piece)

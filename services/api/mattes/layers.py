@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from pydantic_core import to_json
 
 from services.api.context import Context, OwnerContext
-from services.api.http.responses import bytes_response, etag_matches, file_response
+from services.api.http.responses import VERSION, bytes_response, etag_matches, file_response
 from services.api.http.router import Router
 from services.api.http.types import Colour, Pair
 from services.api.mattes import live_module
@@ -153,8 +153,9 @@ async def get_layer(
         raise InvalidInput(f"{file} takes no plate: only {', '.join(OF_PLATE)} do", field="plate")
 
     def headers_of(progress: Progress) -> dict[str, str]:
-        # Neither a matte that is ready nor a preview ever changes.
-        headers = progress.headers | {"ETag": f'"{progress.whole_frame}-{file}-{lobes}-{lookups}-{plate}"'}
+        # Neither a matte that is ready nor a preview ever changes; what is made of them may with an upgrade.
+        tag = f'"{VERSION}-{progress.whole_frame}-{file}-{lobes}-{lookups}-{plate}"'
+        headers = progress.headers | {"ETag": tag}
         # Saved and not shown: here it would be a page of the service.
         return headers | ({"Content-Disposition": "attachment"} if file.endswith(".html") else {})
 

@@ -15,6 +15,7 @@ import uvicorn
 from sqlalchemy import Engine
 
 from services.api.app import BACKDROPS, build_app
+from services.api.mattes import composites, layers
 from services.settings import Settings
 from storage.database.engine import writing
 from storage.database.owners import for_owner
@@ -124,3 +125,18 @@ def test_picture_in_a_form_is_refused(api: Api) -> None:
     answer = httpx2.post(url, files={"file": BACKDROP}, headers=headers, timeout=120)
     assert answer.status_code == 415
     assert "not in a form" in answer.json()["detail"]
+
+
+def test_upgrade_changes_the_tags_of_composites_and_layers(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    def tags() -> list[str]:
+        known = {"Authorization": f"Bearer {api.keys['alice']}", "If-None-Match": "*"}
+        layer = httpx2.get(f"{api.url}/v1/mattes/alice/layers/envmatte.js", headers=known)
+        composite = api.composite("alice", **known)
+        assert (layer.status_code, composite.status_code) == (304, 412)
+        return [layer.headers["etag"], composite.headers["etag"]]
+
+    before = tags()
+    assert tags() == before
+    for module in (layers, composites):
+        monkeypatch.setattr(module, "VERSION", "99.0")
+    assert all(new != old for new, old in zip(tags(), before, strict=True))
