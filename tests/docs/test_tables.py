@@ -14,7 +14,7 @@ from services.runtime.problems import PROBLEMS
 from services.settings import Settings, describe_settings
 from storage.database.engine import open_engine
 from storage.objects.store import Objects
-from tests.docs.readmes import block, codes, table
+from tests.docs.readmes import block, codes, prose, table
 from workflows.ingest.manifest import EXAMPLE
 from workflows.mattes.options import describe_options
 from workflows.programs.presets import RECIPES, preset
@@ -112,6 +112,25 @@ def test_options_of_recovery() -> None:
             assert codes(values) == one["values"], name
         else:
             assert [number(end) for end in values.split(" to ")] == [one["minimum"], one["maximum"]], name
+
+
+def test_cost_of_the_quality_fast() -> None:
+    """The README and the option say what the table of results does."""
+    results = {
+        method: [[float(figure) for figure in re.findall(r"\d+\.\d", cell)] for cell in cells]
+        for method, _, *cells in table(
+            "workflows/recovery/README.md",
+            *("method", "frames", "clear ball", "tinted bunny, dispersion", "frosted lens"),
+        )
+    }
+    fine = results["`lobes`, preset `default`"]
+    fast = results["`lobes`, preset `default`, `quality: fast`"]
+    costs = [before[0] - after[0] for before, after in zip(fine, fast, strict=True)]
+    slowest = max(range(len(fine)), key=lambda scene: fine[scene][1])
+    assert fast[slowest][1] / fine[slowest][1] == pytest.approx(4 / 5, abs=0.05)
+    (quality,) = [one for one in describe_options() if one["name"] == "quality"]
+    for said in (quality["description"], prose("workflows/recovery/README.md")):
+        assert f"takes four fifths of the time and costs {min(costs):.1f} to {max(costs):.1f} dB" in said
 
 
 def test_commands() -> None:
