@@ -17,7 +17,16 @@ Read = Callable[[Connection, str], T]
 PATIENCE = 10.0
 """Seconds within which a database that is restarted should be back."""
 PAUSE = 0.2
-IdempotencyKey = Annotated[str | None, Header(alias="Idempotency-Key", max_length=256)]
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        max_length=256,
+        # Bodies may be archives of many gigabytes, and a repeat is answered before its body comes.
+        description="A name for this request, such as a UUID. Another request with it is answered with what the first "
+        "one made, whatever its body: bodies are not compared.",
+    ),
+]
 
 
 def find_earlier(engine: Engine, key: str | None, call: str, read: Read[T]) -> T | None:

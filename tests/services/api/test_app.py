@@ -56,3 +56,11 @@ def test_head_ignores_range(app: FastAPI) -> None:
         assert client.get("/docs", headers={"Range": asked}).status_code in (206, 416)
         head = client.head("/docs", headers={"Range": asked})
         assert (head.status_code, head.headers["content-length"]) == (200, str(len(whole.content)))
+
+
+def test_idempotency_keys_say_that_bodies_are_not_compared(app: FastAPI) -> None:
+    operations = [one for path in app.openapi()["paths"].values() for one in path.values()]
+    parameters = [one for operation in operations for one in operation.get("parameters", [])]
+    keys = [one["description"] for one in parameters if one["name"].lower() == "idempotency-key"]
+    assert len(keys) >= 3
+    assert all("bodies are not compared" in description for description in keys)
