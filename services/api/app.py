@@ -51,7 +51,11 @@ class App(FastAPI):
 
 
 def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
-    """Build the app. It keeps no state of its own, so any number of apps may serve one database and store."""
+    """Build the app. All that lasts is in the database and the store, so any number of apps may serve them.
+
+    Each has a cache of mattes, decoders and owners' shares of its own: the bounds of memory in the settings are those
+    of one app.
+    """
     app = App(
         title="envmatte",
         version="1",
