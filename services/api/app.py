@@ -109,6 +109,6 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     app.include_router(health.router)
     app.include_router(metrics.router)
     app.include_router(pages.page)
-    app.mount("/web/swagger", pages.compressed(pages.Files(directory=pages.SWAGGER)))
-    app.mount("/web", pages.compressed(pages.MinifiedFiles(directory=pages.WEB)))
+    app.mount("/web/swagger", pages.Compressed(pages.Files(directory=pages.SWAGGER)))
+    app.mount("/web", pages.Compressed(pages.MinifiedFiles(directory=pages.WEB)))
     return app

@@ -13,8 +13,9 @@ from fastapi.responses import FileResponse, HTMLResponse, Response
 from starlette.datastructures import Headers
 from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
-from starlette.types import Scope
+from starlette.types import Receive, Scope, Send
 
+from services.api.http.media_types import preferred
 from services.api.system.minified import TYPES, minified, minified_file
 
 page = APIRouter()
@@ -44,9 +45,7 @@ class Files(StaticFiles):
     """Static files that browsers revalidate each time."""
 
     def file_response(self, *args: Any, **options: Any) -> Response:
-        answer = super().file_response(*args, **options)
-        answer.headers.update(FRESH)
-        return answer
+        return _revalidated(super().file_response(*args, **options))
 
 
 class MinifiedFiles(Files):
@@ -63,16 +62,33 @@ class MinifiedFiles(Files):
         if path.suffix not in TYPES:
             return super().file_response(full_path, stat_result, scope, status_code)
         content, tag = minified_file(path, stat_result.st_mtime)
-        headers = {**FRESH, "ETag": tag}
-        answer = Response(content, status_code, headers, TYPES[path.suffix])
+        answer = Response(content, status_code, {"ETag": tag}, TYPES[path.suffix])
         if self.is_not_modified(answer.headers, Headers(scope=scope)):
-            return NotModifiedResponse(answer.headers)
-        return answer
+            answer = NotModifiedResponse(answer.headers)
+        return _revalidated(answer)
 
 
-def compressed(files: StaticFiles) -> GZipMiddleware:
+def _revalidated(answer: Response) -> Response:
+    """A file that browsers ask for again each time.
+
+    Its tag is weak, because it is the same whether the file is compressed or not (RFC 9110, sect. 8.8.3.3).
+    """
+    answer.headers.update({**FRESH, "ETag": f"W/{answer.headers['ETag']}"})
+    return answer
+
+
+class Compressed(GZipMiddleware):
     """Static files, compressed on their way: all of the app takes a third of its bytes then."""
-    return GZipMiddleware(files, compresslevel=6, exclude_content_types=COMPRESSED_TYPES)
+
+    def __init__(self, files: StaticFiles) -> None:
+        super().__init__(files, compresslevel=6, exclude_content_types=COMPRESSED_TYPES)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        # Starlette takes gzip;q=0, which refuses it (RFC 9110, sect. 12.5.3), for a wish, and GZIP for none.
+        coding = preferred(Headers(scope=scope).get("accept-encoding", ""), ["gzip"]) or "identity"
+        headers = [(name, value) for name, value in scope["headers"] if name != b"accept-encoding"]
+        headers.append((b"accept-encoding", coding.encode()))
+        await super().__call__({**scope, "headers": headers}, receive, send)
 
 
 def _app() -> str:

@@ -37,6 +37,21 @@ def test_files_are_sent_smaller_and_only_if_they_changed(http: TestClient, name:
     assert http.get(f"/web/{name}", headers={"If-None-Match": '"other"'}).status_code == 200
 
 
+@pytest.mark.parametrize(
+    ("accepted", "packed"),
+    [("gzip", True), ("br, GZIP;q=0.5", True), ("gzip;q=0", False), ("gzip ; q=0.00, *", False), ("", False)],
+)
+def test_files_are_compressed_for_who_accepts_it(http: TestClient, accepted: str, packed: bool) -> None:
+    for name in ("app/main.js", "swagger/swagger-ui.css"):
+        answer = http.get(f"/web/{name}", headers={"Accept-Encoding": accepted})
+        assert ("content-encoding" in answer.headers, answer.headers["vary"]) == (packed, "Accept-Encoding")
+        # One tag for both forms, so it is a weak one.
+        assert answer.headers["etag"].startswith('W/"')
+        known = {"Accept-Encoding": accepted, "If-None-Match": answer.headers["etag"]}
+        again = http.get(f"/web/{name}", headers=known)
+        assert (again.status_code, again.headers["etag"]) == (304, answer.headers["etag"])
+
+
 def test_changed_file_is_sent_anew(tmp_path: Path) -> None:
     path = tmp_path / "one.js"
     path.write_text("export const one = 1;\n")
