@@ -7,15 +7,15 @@ from services.client._records import Record
 
 
 def id_of(record: Record | str) -> str:
-    """The id of a record, or the id itself."""
-    return record if isinstance(record, str) else record.id
-
-
-def path_of(kind: type[Record], record: Record | str) -> str:
-    """The path of a record; an id that would be another path is that of none."""
-    id = id_of(record)
+    """The id of a record, or the id itself; one that would be another path is that of none."""
+    id = record if isinstance(record, str) else record.id
     if id in ("", ".", ".."):
         raise NotFound(
             {"title": "Not found", "status": 404, "detail": f"{id!r} is not an id: give one of those listed"}
         )
-    return f"{kind.path}/{quote(id, safe='')}"
+    return id
+
+
+def path_of(kind: type[Record], record: Record | str) -> str:
+    """The path of a record."""
+    return f"{kind.path}/{quote(id_of(record), safe='')}"

@@ -78,6 +78,8 @@ def test_an_id_reaches_no_other_path() -> None:
         for id in ("", ".", ".."):
             with pytest.raises(NotFound, match="is not an id"):
                 client.cancel(id)
+            with pytest.raises(NotFound, match="is not an id"):
+                client.recover(id)
     ids = ["..%2Fcaptures", "a%2Fb", "a%20b%3Fc%23d%252F"]
     assert [call["call"] for call in calls] == [f"GET /v1/jobs/{id}" for id in ids]
 
