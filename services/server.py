@@ -48,11 +48,14 @@ def serve(settings: Settings) -> None:
 
     raise_file_limit()
     sys.setswitchinterval(SWITCH_SECONDS)
-    with _opened(settings, "service") as (stack, engine, objects):
+    with (
+        # The port is bound before anything is made or started, so that one in use is reported at once.
+        bind(settings.host, settings.port) as socket,
+        _opened(settings, "service") as (stack, engine, objects),
+    ):
         require_keys_unless_loopback(settings, engine)
         app = build_app(settings, engine, objects)
         stack.callback(app.state.context.decoders.close)
-        # The port is bound before workers start, so that one in use is reported at once.
         config = uvicorn.Config(
             SecurityHeaders(app),
             settings.host,
@@ -63,7 +66,6 @@ def serve(settings: Settings) -> None:
             lifespan="off",
             timeout_graceful_shutdown=GRACE,
         )
-        socket = stack.enter_context(bind(settings.host, settings.port))
         if settings.coordinate:
             _run_jobs(stack, settings, engine, objects)
         socket.listen()  # from here on connections are accepted, and answered soon

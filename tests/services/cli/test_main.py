@@ -5,6 +5,7 @@ import os
 import re
 import shlex
 import shutil
+import socket
 import subprocess
 import sys
 import threading
@@ -189,6 +190,14 @@ def test_url_and_key_come_from_the_environment_or_its_file(
             subprocess.run([*COMMAND, "status", "j", *options], check=True, timeout=300, env=where)
         keys = [call["Authorization"].removeprefix("Bearer ") for call in calls]
     assert keys == ["of-the-file", "of-the-environment", "given"]
+
+
+def test_exit_code_4_and_no_data_folder_if_the_port_is_taken(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        data, port = tmp_path / "data", taken.getsockname()[1]
+        found = envmatte("serve", "--data", str(data), "--port", str(port))
+    assert (found.returncode, found.stdout, data.exists()) == (4, "", False)
+    assert "choose another port with --port" in found.stderr
 
 
 def test_exit_code_3_if_unreachable_or_busy() -> None:
