@@ -52,8 +52,8 @@ def main() -> None:
     """Environment mattes: film glass in front of a monitor, put it in front of anything.
 
     Exit codes: 0 done; 1 the service refused, a job failed, a file can't be written, or something stored is damaged;
-    2 wrong command line; 3 the service can't be reached, or asks to try again later; 4 another process has the port;
-    130 interrupted.
+    2 wrong command line or settings; 3 the service can't be reached, or asks to try again later; 4 another process has
+    the port; 130 interrupted.
     """
 
 

@@ -7,6 +7,7 @@ import click
 
 from services.cli.options import drop_unset
 from services.cli.output import example
+from storage.errors import InvalidInput
 
 _certs = click.option(
     "--certs",
@@ -16,11 +17,18 @@ _certs = click.option(
 
 
 class _ProcessCommand(click.Command):
-    """A command whose help ends with the settings of its process."""
+    """A command that runs a process. Its help ends with the settings of that."""
 
     def __init__(self, *args: Any, settings: str, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._settings = settings
+
+    def invoke(self, context: click.Context) -> Any:
+        """Run the command; settings that its process can't work with are a wrong command line."""
+        try:
+            return super().invoke(context)
+        except InvalidInput as error:
+            raise click.UsageError(error.detail) from error
 
     def format_epilog(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         super().format_epilog(context, formatter)

@@ -272,6 +272,6 @@ def test_public_address_without_keys_is_refused(tmp_path: Path) -> None:
     ]
     environment = {name: value for name, value in os.environ.items() if name != "ENVMATTE_KEYS"}
     refused = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
-    assert refused.returncode == 1
+    assert refused.returncode == 2
     assert "envmatte keys make" in refused.stderr
     assert "ENVMATTE_KEYS" in refused.stderr

@@ -165,7 +165,14 @@ def test_errors_do_not_command_the_terminal() -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [["fly"], ["status"], ["upload", "no-such-file"], ["status", "j", "--url", "localhost:8000"]],
+    [
+        ["fly"],
+        ["status"],
+        ["upload", "no-such-file"],
+        ["status", "j", "--url", "localhost:8000"],
+        ["worker"],
+        ["scheduler", "--host", "0.0.0.0"],
+    ],
     ids=" ".join,
 )
 def test_exit_code_2_for_a_wrong_command_line(arguments: list[str]) -> None:
