@@ -135,7 +135,11 @@ def delete_capture(context: OwnerContext, id: str) -> None:
     stored_uploads.remove(context.objects, id)
 
 
-@router.get("/captures/{id}/frames/{n}.png", response_class=Response)
+@router.get(
+    "/captures/{id}/frames/{n}.png",
+    response_class=Response,
+    responses={200: {"content": {"image/png": {}}, "description": "The frame"}},
+)
 async def get_frame(context: OwnerContext, id: str, n: int, request: Request) -> Response:
     """A frame as it was stored."""
 

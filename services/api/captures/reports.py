@@ -28,13 +28,21 @@ async def get_report(context: OwnerContext, id: str, request: Request) -> Respon
     return await context.compute(request, context.lists, make)
 
 
-@router.get("/captures/{id}/contact-sheet.png", response_class=Response)
+@router.get(
+    "/captures/{id}/contact-sheet.png",
+    response_class=Response,
+    responses={200: {"content": {"image/png": {}}, "description": "The picture"}},
+)
 async def get_contact_sheet(context: OwnerContext, id: str, request: Request) -> Response:
     """Some of a capture's frames in one picture: red where they are clipped at white, blue where clipped at black."""
     return await _drawn(context, id, request, contact_sheet)
 
 
-@router.get("/captures/{id}/thumbnail.png", response_class=Response)
+@router.get(
+    "/captures/{id}/thumbnail.png",
+    response_class=Response,
+    responses={200: {"content": {"image/png": {}}, "description": "The picture"}},
+)
 async def get_thumbnail(context: OwnerContext, id: str, request: Request) -> Response:
     """The brightest constant frame of a capture, at most 240 pixels wide and high."""
     return await _drawn(context, id, request, thumbnail)

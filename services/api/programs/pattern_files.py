@@ -31,7 +31,11 @@ def _read(context: OwnerContext, id: str) -> Program:
 Stored = Annotated[Program, Depends(in_turn(_read))]
 
 
-@router.get("/programs/{id}/patterns/{n}.png", response_class=Response)
+@router.get(
+    "/programs/{id}/patterns/{n}.png",
+    response_class=Response,
+    responses={200: {"content": {"image/png": {}}, "description": "The pattern"}},
+)
 async def get_pattern(context: OwnerContext, program: Stored, n: int, request: Request) -> Response:
     """A pattern as the monitor shows it."""
     if not 0 <= n < program.count:
@@ -43,7 +47,11 @@ async def get_pattern(context: OwnerContext, program: Stored, n: int, request: R
     return await context.compute(request, context.pictures, draw)
 
 
-@router.get("/programs/{id}/patterns.zip", response_class=StreamingResponse)
+@router.get(
+    "/programs/{id}/patterns.zip",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"application/zip": {}}, "description": "The archive"}},
+)
 async def get_patterns(context: OwnerContext, program: Stored) -> StreamingResponse:
     """`program.json` and a numbered PNG of each pattern, drawn while they are sent."""
     parts = zip_program(program)
@@ -59,7 +67,11 @@ async def get_patterns(context: OwnerContext, program: Stored) -> StreamingRespo
     return StreamingResponse(stream(), media_type="application/zip")
 
 
-@router.get("/programs/{id}/patterns.mp4", response_class=StreamingResponse)
+@router.get(
+    "/programs/{id}/patterns.mp4",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"video/mp4": {}}, "description": "The video"}},
+)
 async def get_film(
     context: OwnerContext,
     program: Stored,
@@ -77,7 +89,11 @@ async def get_film(
     return await context.compute(request, context.films, lambda: file_response(write, "video/mp4"))
 
 
-@page.get("/programs/{id}/play", response_class=FileResponse)
+@page.get(
+    "/programs/{id}/play",
+    response_class=FileResponse,
+    responses={200: {"content": {"text/html": {}}, "description": "The page"}},
+)
 async def get_page(id: str) -> FileResponse:
     """The page that plays a program full screen. The page itself needs no key: it fetches the program, and asks the
     user for a key if that takes one."""

@@ -10,7 +10,7 @@ from fastapi.responses import StreamingResponse
 from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.http.router import Router, in_turn
-from services.api.jobs.events import stream
+from services.api.jobs.events import MEDIA_TYPE, stream
 from services.api.programs.programs import PlaybackState, Program, get_program
 from storage.database.engine import writing
 from storage.records import programs
@@ -35,7 +35,11 @@ def put_showing(context: OwnerContext, id: str, state: Annotated[PlaybackState, 
         programs.set_showing(c, id, state.model_dump(mode="json"))
 
 
-@router.get("/programs/{id}/events", response_class=StreamingResponse)
+@router.get(
+    "/programs/{id}/events",
+    response_class=StreamingResponse,
+    responses={200: {"content": {MEDIA_TYPE: {}}, "description": "An event each time that the page reports"}},
+)
 async def follow_program(
     context: OwnerContext, id: str, last_event_id: Annotated[str | None, Header(max_length=256)] = None
 ) -> Response:

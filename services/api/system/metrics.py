@@ -22,6 +22,7 @@ from storage.records.leases import Heartbeat
 router = Router(tags=["system"])
 KINDS = ("ingest", "recover", "composite")
 JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
+MEDIA_TYPES = ("text/plain", "application/openmetrics-text")
 Labelled = Iterable[tuple[tuple[str, ...], float]]
 
 
@@ -35,7 +36,16 @@ class _Fixed(Collector):
         return self._metrics
 
 
-@router.get("/metrics", response_class=Response)
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={
+        200: {
+            "content": {kind: {} for kind in MEDIA_TYPES},
+            "description": "The metrics, in the form of `Accept`",
+        }
+    },
+)
 def get_metrics(context: AdminContext, request: Request) -> Response:
     """Metrics of the whole service for Prometheus."""
     with reading(context.engine) as c:

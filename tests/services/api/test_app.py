@@ -64,3 +64,9 @@ def test_idempotency_keys_say_that_bodies_are_not_compared(app: FastAPI) -> None
     keys = [one["description"] for one in parameters if one["name"].lower() == "idempotency-key"]
     assert len(keys) >= 3
     assert all("bodies are not compared" in description for description in keys)
+
+
+def test_openapi_has_the_content_type_of_every_answer(app: FastAPI) -> None:
+    for path, operations in app.openapi()["paths"].items():
+        if "get" in operations:
+            assert operations["get"]["responses"]["200"].get("content"), path
