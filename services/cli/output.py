@@ -2,12 +2,16 @@
 
 import json
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import click
+
+from services.runtime.whole_files import open_whole
+
+STANDARD_OUTPUT = 1
+"""Its file descriptor."""
 
 
 def example(*lines: str, more: str = "") -> str:
@@ -20,6 +24,12 @@ def print_result(result: Mapping[str, Any], as_json: bool, *names: str) -> None:
     click.echo(json.dumps(result, indent=2) if as_json else " ".join(str(result[name]) for name in names))
 
 
+def print_output(output: Path, as_json: bool) -> None:
+    """Print the name of a file that was written, unless that is standard output, which has the file itself."""
+    if not os.path.samestat(output.stat(), os.fstat(STANDARD_OUTPUT)):
+        print_result({"output": str(output)}, as_json, "output")
+
+
 def print_summary(result: Mapping[str, Any], as_json: bool, summary: str) -> None:
     """Print a result as JSON, with a summary, or the summary alone."""
     print_result({**result, "told": summary}, as_json, "told")
@@ -29,15 +39,3 @@ def write(path: Path, data: bytes) -> None:
     """Write a file whole or not at all."""
     with open_whole(path) as file:
         file.write(data)
-
-
-@contextmanager
-def open_whole(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that appears only once all of it is written."""
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            yield file
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

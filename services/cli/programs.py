@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import click
 
 from services.cli.options import InputFile, OutputFile, as_json
-from services.cli.output import example, open_whole, print_result
+from services.cli.output import example, print_output, print_result
 from services.cli.progress import Progress
 from services.decoding.first_bytes import LENGTH, is_video
+from services.runtime.whole_files import open_whole
 from workflows.programs.preset_names import PRESETS
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ def pack(program: Path, source: Path, output: Path, as_json: bool) -> None:
         record, files = film_record(program, source)
     with open_whole(output) as file:
         write_archive(file, {**record, "name": source.stem}, files)
-    print_result({"output": str(output)}, as_json, "output")
+    print_output(output, as_json)
 
 
 def stills_in(folder: Path, program: "Program") -> Sequence[Path]:

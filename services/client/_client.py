@@ -1,6 +1,5 @@
 """The client's calls."""
 
-import os
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
 from services.client._errors import JobFailed, NotFound
 from services.client._paths import id_of, path_of
 from services.client._records import Capture, Job, Layers, Matte, Record
+from services.runtime.whole_files import open_whole
 
 if TYPE_CHECKING:
     from services.client._arrays import Floats
@@ -326,29 +326,28 @@ class Client:
     def export(
         self, matte: Matte | str, file: Path, *, progress: Callable[[int, int], None] | None = None
     ) -> None:
-        """Write a matte's archive to a file, whole or not at all.
+        """Write a matte's archive to a file, whole or not at all; to a pipe as it comes.
 
         Parameters
         ----------
         progress : callable, optional
             Is called with the bytes received, and with all there are.
         """
-        part = file.with_name(file.name + ".part")
+        with open_whole(file) as out:
+            may_restart = out.seekable()
 
-        def get() -> None:
-            with self._http.streamed("GET", f"{path_of(Matte, matte)}/archive") as answer:
-                size = int(self._http.header(answer, "Content-Length"))
-                with part.open("wb") as out:
+            def get() -> None:
+                with self._http.streamed("GET", f"{path_of(Matte, matte)}/archive") as answer:
+                    size, done = int(self._http.header(answer, "Content-Length")), 0
+                    if may_restart:
+                        out.seek(0)
+                        out.truncate()
                     for data in answer.iter_bytes():
-                        out.write(data)
+                        done += out.write(data)
                         if progress:
-                            progress(out.tell(), size)
+                            progress(done, size)
 
-        try:
-            self._http.patiently(get)
-            os.replace(part, file)
-        finally:
-            part.unlink(missing_ok=True)
+            self._http.patiently(get, safe=may_restart)
 
     def import_matte(
         self, file: Path, *, name: str = "", progress: Callable[[int, int], None] | None = None

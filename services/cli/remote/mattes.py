@@ -7,10 +7,11 @@ from typing import Any
 import click
 
 from services.cli import options
-from services.cli.output import example, open_whole, print_result, write
+from services.cli.output import example, print_output, print_result, write
 from services.cli.programs import is_film
 from services.cli.progress import Progress
 from services.client import Client
+from services.runtime.whole_files import open_whole
 
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".exr": "image/x-exr"}
 """Of composites, by the ends of file names."""
@@ -77,7 +78,7 @@ def composite(
         else:
             kind = MEDIA_TYPES[output.suffix.lower()]
             write(output, client.composite(matte, backdrop, kind=kind, **given))
-    print_result({"output": str(output)}, as_json, "output")
+    print_output(output, as_json)
 
 
 def _composite_clip(client: Client, matte: str, clip: Path, output: Path, params: dict[str, Any]) -> None:
@@ -109,7 +110,7 @@ def export(matte: str, output: Path, html: bool, url: str, key: str | None, as_j
         else:
             with Progress("export") as bar:
                 client.export(matte, output, progress=lambda done, size: bar.show(done / size))
-    print_result({"output": str(output)}, as_json, "output")
+    print_output(output, as_json)
 
 
 @click.command(epilog=example("envmatte share MATTE", "envmatte share MATTE --days 365"))
