@@ -247,7 +247,8 @@ class Client:
         Returns
         -------
         bytes, or (height, width, 3 or 4) float32
-            Linear light in arrays, of the matte's size unless another was asked for; with alpha if there is a mask.
+            Linear light in arrays, of the matte's size unless another was asked for; with alpha if there is a mask,
+            which light is multiplied with.
         """
         if isinstance(backdrop, bytes | Path):
             data = backdrop.read_bytes() if isinstance(backdrop, Path) else backdrop

@@ -109,7 +109,8 @@ async def post_composite(
     """Put the glass in front of a backdrop: the body is an image, and the answer is one of the matte's size.
 
     A PNG has as many bits as the backdrop, 8 or 16, and 16 for a float backdrop. Pixels that were not recovered are
-    transparent in a PNG and black in a JPEG. An EXR holds linear light, with values that may be negative or above 1.
+    transparent in a PNG and black in a JPEG. An EXR holds linear light, with values that may be negative or above 1,
+    multiplied with alpha.
     If the matte is still being recovered, the composite shows the blocks that are done, elsewhere the preview if there
     is one, and `Envmatte-Recovered` is the share of the blocks. A composite that the caller already has, by
     `If-None-Match`, is not computed again; the answer is 412.
@@ -371,6 +372,8 @@ def _rays(context: Context, progress: Progress, params: CompositeParams) -> Rays
 
 
 def _exr(picture: Picture) -> bytes:
+    """Encode a picture, whose light is multiplied in place with alpha, as readers of EXR expect it."""
+    picture[..., :3] *= picture[..., 3:]
     opaque = bool((picture[..., 3] == 1).all())
     return float_formats.encode_exr("RGB" if opaque else "RGBA", picture)
 

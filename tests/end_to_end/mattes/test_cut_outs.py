@@ -42,8 +42,22 @@ def test_the_object_is_cut_out(service: Service, tmp_path: Path) -> None:
     np.testing.assert_array_equal(around[within], alone[within])
     assert not np.array_equal(camera[within], alone[within])
     np.testing.assert_array_equal(camera, decoded(post_composite(service, job["matte"])))
+    for query in ({"fit": "frame", "enlarge": 2}, {"size": 50}, {}):
+        assert_exr_is_multiplied_with_alpha(service, job["matte"], query)
     assert_files_take_a_plate(service, job["matte"], within)
     assert_command_writes_them(service, job["matte"], tmp_path / "glass")
+
+
+def assert_exr_is_multiplied_with_alpha(service: Service, matte: str, query: dict[str, str | int]) -> None:
+    backdrop = np.full((3, 4, 3), 0.5, np.float32)
+    found = service.client.composite(matte, backdrop, **query)
+    sent = float_formats.encode_exr("RGB", backdrop)
+    png = integer_formats.decode(
+        post_composite(service, matte, sent, transfer="linear", **query).content, memory=1 << 24, alpha=True
+    )
+    straight = integer_formats.to_unit(png)
+    assert (((found[..., 3] > 0) & (found[..., 3] < 1)).any()) == bool(query)
+    assert np.abs(np.clip(found[..., :3], 0, 1) - straight[..., :3] * straight[..., 3:]).max() < 1e-3
 
 
 def assert_files_take_a_plate(service: Service, matte: str, within: NDArray[np.bool_]) -> None:
