@@ -164,6 +164,8 @@ def _explain(method: type[RecoveryOptions], name: str) -> str:
         option = _describe(method, name)
         if option["values"]:
             return f"option {name!r}: must be one of {', '.join(option['values'])}"
+        if option["type"] == "boolean":
+            return f"option {name!r}: must be true or false"
         whole = "a whole number " if option["type"] == "integer" else ""
         return f"option {name!r}: must be {whole}between {option['minimum']:g} and {option['maximum']:g}"
     owners = [_name(other) for other in METHODS if name in other.model_fields]

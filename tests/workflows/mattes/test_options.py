@@ -95,6 +95,8 @@ def test_error_names_the_option(given: dict[str, Any], field: str) -> None:
         ({"method": "nn-dgsr", "sparsity": 2}, "option 'sparsity': must be between 0.01 and 1"),
         ({"method": "nn-dgsr", "sparsity": "few"}, "option 'sparsity': must be between 0.01 and 1"),
         ({"tile": 15}, "option 'tile': must be a whole number between 16 and 1024"),
+        ({"cut_out": "maybe"}, "option 'cut_out': must be true or false"),
+        ({"cut_out": None}, "option 'cut_out': must be true or false"),
         ({"method": "magic"}, "option 'method': must be one of lobes, nn-dgsr"),
         ({"method": "nn-dgsr", "prior": "x"}, "option 'prior': must be one of gaussian, none"),
         ({"sparsity": 0.1}, "option 'sparsity' belongs to the method nn-dgsr, not to lobes"),

@@ -181,6 +181,7 @@ export const de = {
 	"one that gives {share} % of the light at half of the range": "eine mit {share} % des Lichts in der Mitte des Wertebereichs",
 	"only assumed": "nur angenommen",
 	"only {share} of the patterns are found": "nur {share} der Muster sind zu finden",
+	"option {name}: must be true or false": "Option {name}: erlaubt ist wahr (true) oder falsch (false)",
 	"option {name}: must {be}between {least} and {most}": "Option {name}: erlaubt ist {least} bis {most}",
 	"other requests are served first; send this one again later": "andere Anfragen sind zuerst dran; später noch einmal senden",
 	"preparing": "Vorbereitung",
