@@ -101,6 +101,11 @@ class Client:
             The part of the frame that is recovered first, in pixels.
         **options
             As ``GET /v1/options`` lists them.
+
+        Raises
+        ------
+        ValueError
+            If `region` is not four numbers.
         """
         body: dict[str, Any] = {"capture": id_of(capture), "options": options}
         body |= ({"webhook": webhook} if webhook else {}) | ({"region": _region(region)} if region else {})
@@ -383,7 +388,10 @@ class Client:
 
 
 def _region(region: tuple[int, int, int, int]) -> dict[str, int]:
-    return dict(zip(("x", "y", "width", "height"), region, strict=True))
+    try:
+        return dict(zip(("x", "y", "width", "height"), region, strict=True))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"a region is (x, y, width, height) in pixels, and not {region!r}") from error
 
 
 def _key() -> dict[str, str]:

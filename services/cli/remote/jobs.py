@@ -1,6 +1,7 @@
 """Commands for captures and jobs: upload, recover, follow."""
 
 import json
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -140,13 +141,20 @@ def cancel(job: str, url: str, key: str | None, as_json: bool) -> None:
 
 
 def _parse_option(option: str) -> tuple[str, Any]:
-    name, equals, value = option.partition("=")
+    name, equals, text = option.partition("=")
     if not equals:
         raise click.UsageError(f"--option {option}: give it as NAME=VALUE")
+    if name in signature(Client.recover).parameters:
+        raise click.UsageError(f"--option {option}: {name} is no option of a recovery, see GET /v1/options")
     try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
+        value = json.loads(text)
+    except ValueError:
+        value = text
+    try:
+        json.dumps((name, value), allow_nan=False, ensure_ascii=False).encode()
+    except ValueError as error:
+        raise click.UsageError(f"--option {option}: this can't be sent as JSON") from error
+    return name, value
 
 
 COMMANDS = (upload, recover, status, wait, pause, resume, cancel)

@@ -407,3 +407,17 @@ echo "${COMPREPLY[@]}"
     )
     assert done.stdout.splitlines()[-1] == "--transfer", done.stderr
     assert "_envmatte_completion envmatte" in done.stdout
+
+
+@pytest.mark.parametrize("option", ["region=1", "webhook=https://x", "capture=c", "self=1", "options=1"])
+def test_what_is_no_option_of_a_recovery_is_refused(option: str) -> None:
+    done = CliRunner().invoke(main, ["recover", "c", "--option", option])
+    assert done.exit_code == 2
+    assert "is no option of a recovery" in done.stderr
+
+
+@pytest.mark.parametrize("option", ["tile=1e400", "tile=NaN", "tile=[-Infinity]", 'method="\\ud800"'])
+def test_an_option_that_json_does_not_have_is_refused(option: str) -> None:
+    done = CliRunner().invoke(main, ["recover", "c", "--option", option])
+    assert done.exit_code == 2
+    assert "can't be sent as JSON" in done.stderr

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -86,3 +87,12 @@ def test_an_id_reaches_no_other_path() -> None:
 
 def test_package_is_marked_as_typed() -> None:
     assert Path(package.__file__).parents[1].joinpath("py.typed").is_file()
+
+
+@pytest.mark.parametrize("region", [(1, 2), (1, 2, 3, 4, 5), 1])
+def test_a_region_that_is_not_four_numbers_is_refused(region: Any) -> None:
+    with scripted_server(lambda n: ok()) as (url, calls), Client(url) as client:
+        for ask in (lambda: client.recover("c", region=region), lambda: client.recover_first("j", region)):
+            with pytest.raises(ValueError, match=r"a region is \(x, y, width, height\)"):
+                ask()
+    assert not calls
