@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -26,6 +27,23 @@ class _OutputFile(click.Path):
         return file
 
 
+class _Number(click.types.FloatParamType):
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
+
+
+class NumberRange(click.FloatRange):
+    """A finite number within a range: click has NaN within each."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        return super().convert(Number.convert(value, param, ctx), param, ctx)
+
+
+Number = _Number()
+"""A finite number."""
 OutputFile = _OutputFile(dir_okay=False, path_type=Path)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 data = click.option("--data", type=click.Path(path_type=Path), help="Folder of the service's data.")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import click
 
-from services.cli.options import InputFile, OutputFile, as_json
+from services.cli.options import InputFile, NumberRange, OutputFile, as_json
 from services.cli.output import example, print_output, print_result
 from services.cli.progress import Progress
 from services.decoding.first_bytes import LENGTH, is_video
@@ -49,7 +49,7 @@ def _size(context: click.Context, parameter: click.Parameter, text: str | None) 
 )
 @click.option(
     "--rate",
-    type=click.FloatRange(0.1, 30),
+    type=NumberRange(0.1, 30),
     default=2.0,
     show_default=True,
     help="Patterns per second of a video.",

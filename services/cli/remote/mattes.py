@@ -37,10 +37,10 @@ OF_PLATE = ("stmap.exr", "blender.py", "nuke.nk", "nuke_stmap.nk")
     help="File to write: .png, .jpg or .exr; .mp4 for a clip.",
 )
 @click.option("--transfer", type=click.Choice(["srgb", "linear"]), default="srgb", show_default=True)
-@click.option("--right", type=float, help="Move the backdrop to the right, in monitor widths.")
-@click.option("--down", type=float, help="Move the backdrop down, in monitor heights.")
-@click.option("--scale", type=float, help="Scale the backdrop by this factor.")
-@click.option("--angle", type=float, help="Rotate the backdrop clockwise, in degrees.")
+@click.option("--right", type=options.Number, help="Move the backdrop to the right, in monitor widths.")
+@click.option("--down", type=options.Number, help="Move the backdrop down, in monitor heights.")
+@click.option("--scale", type=options.Number, help="Scale the backdrop by this factor.")
+@click.option("--angle", type=options.Number, help="Rotate the backdrop clockwise, in degrees.")
 @click.option(
     "--around",
     type=click.Choice(["nothing", "backdrop"]),
@@ -115,7 +115,7 @@ def export(matte: str, output: Path, html: bool, url: str, key: str | None, as_j
 
 @click.command(epilog=example("envmatte share MATTE", "envmatte share MATTE --days 365"))
 @click.argument("matte")
-@click.option("--days", type=click.FloatRange(0, 3650, min_open=True), default=30, show_default=True)
+@click.option("--days", type=options.NumberRange(0, 3650, min_open=True), default=30, show_default=True)
 @options.remote
 def share(matte: str, days: float, url: str, key: str | None, as_json: bool) -> None:
     """Make a link by which anyone can see a matte, live, without a key. Prints its URL."""

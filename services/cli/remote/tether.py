@@ -45,7 +45,7 @@ class Taken(NamedTuple):
 @click.argument("source", type=click.Path(exists=True, path_type=Path), metavar="STILLS|FILM")
 @click.option(
     "--until",
-    type=float,
+    type=options.Number,
     metavar="DB",
     help="Stop once composites, of difficult glass too, are expected to come within this PSNR of the truth.",
 )

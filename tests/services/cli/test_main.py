@@ -411,13 +411,29 @@ echo "${COMPREPLY[@]}"
 
 @pytest.mark.parametrize("option", ["region=1", "webhook=https://x", "capture=c", "self=1", "options=1"])
 def test_what_is_no_option_of_a_recovery_is_refused(option: str) -> None:
-    done = CliRunner().invoke(main, ["recover", "c", "--option", option])
+    done = CliRunner().invoke(main, ["recover", "c", "--option", option, *UNREACHABLE])
     assert done.exit_code == 2
     assert "is no option of a recovery" in done.stderr
 
 
 @pytest.mark.parametrize("option", ["tile=1e400", "tile=NaN", "tile=[-Infinity]", 'method="\\ud800"'])
 def test_an_option_that_json_does_not_have_is_refused(option: str) -> None:
-    done = CliRunner().invoke(main, ["recover", "c", "--option", option])
+    done = CliRunner().invoke(main, ["recover", "c", "--option", option, *UNREACHABLE])
     assert done.exit_code == 2
     assert "can't be sent as JSON" in done.stderr
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
+def test_numbers_are_finite(number: str) -> None:
+    floats = [
+        option
+        for command in ALL.values()
+        for option in command.params
+        if isinstance(option.type, type(click.FLOAT))
+    ]
+    assert {"days", "until", "rate", "right"} <= {option.name for option in floats}
+    for option in floats:
+        with pytest.raises(click.BadParameter):
+            option.type.convert(number, option, None)
+    done = CliRunner().invoke(main, ["share", "m", "--days", number, *UNREACHABLE])
+    assert (done.exit_code, "Invalid value for '--days'" in done.stderr) == (2, True)
