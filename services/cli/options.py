@@ -7,7 +7,7 @@ from typing import Any, TypeVar, cast
 
 import click
 
-from services.client import Client
+from services.client import Client, InvalidKey
 from services.runtime.environment import read_environment
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -87,4 +87,5 @@ def client(url: str, key: str | None) -> Client:
     try:
         return Client(url, key)
     except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--url") from error
+        hint = "--key" if isinstance(error, InvalidKey) else "--url"
+        raise click.BadParameter(str(error), param_hint=hint) from error

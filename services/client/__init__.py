@@ -24,6 +24,8 @@ Every failure is one of these errors, with the problem detail (RFC 9457) as ``pr
     ├── FileChanged         a file changed while it was sent
     └── JobFailed           a job failed or was cancelled: ``job``
 
+Wrong arguments are a `ValueError`, a key that can't be sent an `InvalidKey`, which is one.
+
 Requests that are safe to repeat are retried with growing pauses when a service that has answered before becomes
 unreachable: reads, deletes, and requests with an Idempotency-Key, which every call here that creates something has. The
 client waits as long as ``Retry-After`` says.
@@ -33,6 +35,7 @@ from services.client._client import Client
 from services.client._errors import (
     Busy,
     FileChanged,
+    InvalidKey,
     JobFailed,
     NotAllowed,
     NotFound,
@@ -46,6 +49,7 @@ __all__ = [
     "Capture",
     "Client",
     "FileChanged",
+    "InvalidKey",
     "Job",
     "JobFailed",
     "Layers",

@@ -37,6 +37,8 @@ class Client:
     ------
     ValueError
         If the URL is not an HTTP URL.
+    InvalidKey
+        If the key can't be sent.
 
     Notes
     -----

@@ -69,3 +69,10 @@ OF_STATUS: dict[int, type[ServiceError]] = {
     503: Busy,
     504: Busy,
 }
+
+
+class InvalidKey(ValueError):
+    """An API key that can't be sent. It is not shown: most of it may be right."""
+
+    def __init__(self) -> None:
+        super().__init__("the API key has a line break or other characters that no key has: copy it again")

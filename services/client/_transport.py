@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import httpx2
 
-from services.client._errors import OF_STATUS, Busy, ServiceError, Unreachable
+from services.client._errors import OF_STATUS, Busy, InvalidKey, ServiceError, Unreachable
 
 logger = logging.getLogger(__name__)
 
@@ -43,9 +43,13 @@ class Transport:
     ------
     ValueError
         If the URL is not an HTTP URL.
+    InvalidKey
+        If the key can't be sent.
     """
 
     def __init__(self, url: str, key: str | None) -> None:
+        if key and not (key.isascii() and key.isprintable() and key == key.strip()):
+            raise InvalidKey
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         try:
             base = httpx2.URL(url)

@@ -437,3 +437,29 @@ def test_numbers_are_finite(number: str) -> None:
             option.type.convert(number, option, None)
     done = CliRunner().invoke(main, ["share", "m", "--days", number, *UNREACHABLE])
     assert (done.exit_code, "Invalid value for '--days'" in done.stderr) == (2, True)
+
+
+@pytest.mark.parametrize("command", [["status", "j"], ["demo"]], ids=" ".join)
+@pytest.mark.parametrize("key", ["secr\u00fct", "secret\n", "sec\x00ret", " secret"])
+def test_a_key_that_cannot_be_sent_is_refused_without_being_shown(command: list[str], key: str) -> None:
+    done = CliRunner().invoke(main, [*command, "--key", key, *UNREACHABLE])
+    assert done.exit_code == 2
+    assert "Invalid value for --key: the API key has" in done.stderr
+    assert "secr" not in done.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["-o", "q.jpg"], "--output: q.jpg: the name must end in .png"),
+        (["--workers", "0"], "'--workers': 0 is not in the range"),
+        (["--url", "localhost:8000"], "--url: 'localhost:8000' is not the URL of a service"),
+    ],
+)
+def test_wrong_options_of_the_demo_are_refused_before_it_begins(
+    arguments: list[str], reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.cli.demo_run.run", lambda *_, **__: pytest.fail("it began"))
+    done = CliRunner().invoke(main, ["demo", *arguments])
+    assert done.exit_code == 2
+    assert reason in " ".join(done.stderr.split())
