@@ -185,8 +185,10 @@ def write_archive(target: BinaryIO | Path, record: Mapping[str, Any], files: Map
             archive.write(path, name)
 
 
-def is_film(file: Path) -> bool:
-    """Whether a file begins as a video does."""
+def is_film(file: Path | bytes) -> bool:
+    """Whether a file, or what was read of one, begins as a video does."""
+    if isinstance(file, bytes):
+        return is_video(file)
     with file.open("rb") as source:
         return is_video(source.read(LENGTH))
 

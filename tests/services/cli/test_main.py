@@ -463,3 +463,23 @@ def test_wrong_options_of_the_demo_are_refused_before_it_begins(
     done = CliRunner().invoke(main, ["demo", *arguments])
     assert done.exit_code == 2
     assert reason in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("start", "code"), [(b"\x89PNG\r\n\x1a\n", 0), (b"\0\0\0\x18ftypisom", 2)], ids=["picture", "clip"]
+)
+def test_a_backdrop_from_a_pipe(tmp_path: Path, start: bytes, code: int) -> None:
+    sent = start + bytes(300)
+    os.mkfifo(tmp_path / "pipe")
+    writer = threading.Thread(target=lambda: (tmp_path / "pipe").write_bytes(sent), daemon=True)
+    writer.start()
+    with scripted_server(lambda n: (200, {}, b"a composite")) as (url, calls):
+        output = tmp_path / "out.png"
+        command = ["composite", "m", str(tmp_path / "pipe"), "-o", str(output), "--url", url]
+        done = CliRunner().invoke(main, command)
+        writer.join(60)
+    assert done.exit_code == code, done.output
+    if code:
+        assert "save it to a file" in done.stderr
+    else:
+        assert [call["body"] for call in calls] == [sent]
