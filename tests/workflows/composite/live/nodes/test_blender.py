@@ -110,6 +110,17 @@ print(group.label, [one.name for one in (*group.inputs, *group.outputs)], held.f
 """Runs a script as the text editor does, where only the text's name is in ``__file__``."""
 
 
+def test_an_output_that_blender_would_write_under_another_name_is_refused(
+    objects: Objects, tmp_path: Path
+) -> None:
+    write_nodes(few_nodes(objects, 3), tmp_path, 3)
+    (tmp_path / "bpy.py").touch()  # Blender's own module is not asked for anything
+    command = [sys.executable, str(tmp_path / "blender.py"), "--", "--output", str(tmp_path / "glass.png")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert "--output must end in .exr" in done.stderr
+
+
 @needs_blender
 def test_the_text_editor_adds_a_group_and_leaves_the_output(objects: Objects, tmp_path: Path) -> None:
     write_nodes(few_nodes(objects, 3), tmp_path, 3)

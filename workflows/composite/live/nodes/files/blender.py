@@ -372,6 +372,8 @@ def main() -> None:
         "--material", action="store_true", help="Make a material of the glass before the backdrop."
     )
     given = parser.parse_args(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else [])
+    if given.output and given.output.suffix.lower() != ".exr":
+        parser.error("--output must end in .exr")  # Blender would write it under another name
     scene = bpy.context.scene
     scene.use_nodes = True
     if given.output:  # a scene of its own, without the cube and the render that new scenes show
