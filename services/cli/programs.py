@@ -117,9 +117,7 @@ def pack(program: Path, source: Path, output: Path, as_json: bool) -> None:
     beside the pictures; there is one still of each, the first by name that of the first pattern.
     """
     if source.is_dir():
-        from workflows.programs.files import fit_to_screen, load_program
-
-        shown = fit_to_screen(load_program(str(program)), None, bordered=False)
+        shown = shown_program(program)
         stills = stills_in(source, shown)
         if len(stills) < shown.count:
             raise _miscounted(source, len(stills), shown)
@@ -129,6 +127,17 @@ def pack(program: Path, source: Path, output: Path, as_json: bool) -> None:
     with open_whole(output) as file:
         write_archive(file, {**record, "name": source.stem}, files)
     print_output(output, as_json)
+
+
+def shown_program(file: Path) -> "Program":
+    """The program in a file, as its stills show it; a usage error if there is none."""
+    from storage.errors import OptionError
+    from workflows.programs.files import fit_to_screen, load_program
+
+    try:
+        return fit_to_screen(load_program(str(file)), None, bordered=False)
+    except OptionError as error:
+        raise click.UsageError(error.detail) from error
 
 
 def stills_in(folder: Path, program: "Program") -> Sequence[Path]:

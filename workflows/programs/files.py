@@ -20,7 +20,7 @@ from workflows.programs.border import Border
 from workflows.programs.preset_names import PRESETS
 from workflows.programs.presets import preset
 from workflows.programs.program import Images, Program
-from workflows.untrusted.validation import reason
+from workflows.untrusted.validation import field_and_reason, reason
 
 Size = tuple[int, int]
 DEFAULT_SCREEN = 1280, 960
@@ -35,9 +35,7 @@ def load_program(name: str) -> str | Program:
     Raises
     ------
     OptionError
-        If ``name`` is neither a preset nor a JSON file.
-    pydantic.ValidationError
-        If the JSON is not a program.
+        If ``name`` is neither a preset nor a JSON file with a program.
     """
     if name in PRESETS:
         return name
@@ -52,7 +50,11 @@ def load_program(name: str) -> str | Program:
         found = json.loads(file.read_bytes())
     except ValueError as error:
         raise OptionError(f"{name} is not JSON: {error}", field="program") from error
-    return Program.model_validate(found.get("program", found) if isinstance(found, dict) else found)
+    try:
+        return Program.model_validate(found.get("program", found) if isinstance(found, dict) else found)
+    except ValidationError as error:
+        why = " ".join(field_and_reason(error.errors())).strip()
+        raise OptionError(f"{name} has no program: {why}", field="program") from error
 
 
 def fit_to_screen(

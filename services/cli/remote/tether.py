@@ -12,7 +12,7 @@ import click
 
 from services.cli import options
 from services.cli.output import example, print_result
-from services.cli.programs import film_record, stills_in, stills_record, write_archive
+from services.cli.programs import film_record, shown_program, stills_in, stills_record, write_archive
 from services.cli.progress import Progress
 from services.cli.remote.jobs import ingest
 from services.client import Capture, Client, Job, JobFailed, ServiceError
@@ -63,9 +63,7 @@ def tether(
     From eight patterns on there is a draft, and as soon as that is done another one, of all that has been taken by
     then. The last matte is the best that it gives; drafts are deleted once there is a better one.
     """
-    from workflows.programs.files import fit_to_screen, load_program
-
-    shown = fit_to_screen(load_program(str(program)), None, bordered=False)
+    shown = shown_program(program)
     takes = _stills(source, shown, name) if source.is_dir() else _film(source, program, name)
     draft: Job | None = None
     last = False

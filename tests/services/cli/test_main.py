@@ -483,3 +483,16 @@ def test_a_backdrop_from_a_pipe(tmp_path: Path, start: bytes, code: int) -> None
         assert "save it to a file" in done.stderr
     else:
         assert [call["body"] for call in calls] == [sent]
+
+
+def test_a_file_without_a_program_is_named(tmp_path: Path) -> None:
+    (tmp_path / "bad.json").write_text("{}")
+    file = str(tmp_path / "bad.json")
+    for command in (
+        ["patterns", file, str(tmp_path / "out")],
+        ["pack", file, str(tmp_path), "-o", str(tmp_path / "x.zip")],
+        ["tether", file, str(tmp_path)],
+    ):
+        done = CliRunner().invoke(main, command)
+        assert done.exit_code == 2
+        assert f"{file} has no program: monitor is required" in done.stderr
