@@ -17,6 +17,7 @@ after another as ``interval``: how far a composite may be from the truth. `workf
 is made of them.
 """
 
+import operator
 from functools import partial
 from typing import Any, Protocol
 
@@ -66,9 +67,12 @@ def dataset_of(matte: Source, lobes: int = LOBES) -> xr.Dataset:
 
     Raises
     ------
+    TypeError
+        If `lobes` is not a whole number.
     ValueError
-        If `lobes` is not from 1 to 8.
+        If it is not from 1 to 8.
     """
+    lobes = operator.index(lobes)
     if not 1 <= lobes <= MOST_LOBES:
         raise ValueError(f"lobes is {lobes}: ask for 1 to {MOST_LOBES}")
     edge = matte.attributes["block"]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 __all__ = ["open"]
-_MATTE = re.compile(r"(https?://.+?)/(?:v1/mattes|#/mattes)/([\w-]+)")
+_MATTE = re.compile(r"((?i:https?)://.+?)/(?:v1/mattes|#/mattes)/([\w-]+)")
 """The URL of a matte in the API, or in the app."""
 
 
@@ -43,6 +43,8 @@ def open(matte: str | Path | BinaryIO, *, lobes: int = 4, key: str | None = None
     ------
     ImportError
         If xarray is not installed.
+    TypeError
+        If `lobes` is not a whole number.
     ValueError
         If the URL is not that of a matte, the matte is not ready, or `lobes` is out of range.
     storage.errors.ArchiveError
@@ -61,7 +63,7 @@ def open(matte: str | Path | BinaryIO, *, lobes: int = 4, key: str | None = None
     from .remote import RemoteMatte
 
     source: Source
-    if isinstance(matte, str) and re.match(r"https?://", matte):
+    if isinstance(matte, str) and re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", matte):
         found = _MATTE.match(matte)
         if not found:
             raise ValueError(f"{matte} is not the URL of a matte: give it as http://HOST:PORT/v1/mattes/ID")

@@ -24,4 +24,4 @@ class Engine(BackendEntrypoint):
     ) -> xr.Dataset:
         """Open a matte, see `envmatte.open`."""
         dropped = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
-        return open(filename_or_obj, lobes=lobes, key=key).drop_vars(dropped)
+        return open(filename_or_obj, lobes=lobes, key=key).drop_vars(dropped, errors="ignore")

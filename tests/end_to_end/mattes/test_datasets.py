@@ -56,11 +56,18 @@ def test_url_opens_with_the_values_of_the_service(service: Service, matte: str, 
     check_values(service, matte, envmatte.open(url.format(service.url, matte)))
 
 
+def test_url_in_capitals_opens(service: Service, matte: str) -> None:
+    found = envmatte.open(f"{service.url}/v1/mattes/{matte}".replace("http", "HTTP"))
+    assert found.alpha[0, 0].compute().dtype == np.float32
+
+
 def test_archive_opens_with_the_values_of_the_service(service: Service, matte: str, tmp_path: Path) -> None:
     file = tmp_path / "matte.zip"
     service.client.export(matte, file)
     check_values(service, matte, envmatte.open(file))
     check_values(service, matte, xr.open_dataset(str(file), engine="envmatte"))
+    fewer = xr.open_dataset(str(file), engine="envmatte", drop_variables=["S", "unknown"])
+    assert set(envmatte.open(file)) - set(fewer) == {"S"}
 
 
 def test_url_is_read_block_by_block(service: Service, matte: str, read: dict[str, int]) -> None:
@@ -112,6 +119,8 @@ def test_what_cannot_be_opened_is_refused_in_words(service: Service, tmp_path: P
         envmatte.open(f"{service.url}/v1/mattes/{'0' * 32}")
     with pytest.raises(ValueError, match="not the URL of a matte: give it as http://HOST:PORT/v1/mattes/ID"):
         envmatte.open(f"{service.url}/v1/captures")
+    with pytest.raises(ValueError, match="not the URL of a matte"):
+        envmatte.open("ftp://127.0.0.1/v1/mattes/m")
     with pytest.raises(Unreachable, match="no answer"):
         envmatte.open(f"http://127.0.0.1:{free_port()}/v1/mattes/{'0' * 32}")
     with pytest.raises(FileNotFoundError, match="nothing"):

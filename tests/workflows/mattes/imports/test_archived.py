@@ -120,6 +120,11 @@ def test_lobes_outside_the_limits_are_refused(archive: bytes, lobes: int) -> Non
         dataset_of(ArchivedMatte(io.BytesIO(archive)), lobes)
 
 
+def test_lobes_that_are_not_a_whole_number_are_refused(archive: bytes) -> None:
+    with pytest.raises(TypeError, match="integer"):
+        dataset_of(ArchivedMatte(io.BytesIO(archive)), 2.5)  # type: ignore[arg-type]
+
+
 def test_what_is_no_archive_of_a_matte_is_refused_in_words(archive: bytes) -> None:
     with pytest.raises(ArchiveError, match="not a ZIP archive, or it is cut off"):
         ArchivedMatte(io.BytesIO(archive[: len(archive) // 2]))
