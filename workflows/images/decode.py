@@ -12,10 +12,15 @@ from storage.errors import ImageError
 from workflows.images import camera_raw, float_formats, heif, integer_formats, raw_files, web_formats
 from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
+from workflows.images.tone_curves import from_light
 
 Transfer = Literal["srgb", "linear"]
 FORMATS = (*integer_formats.FORMATS, *web_formats.FORMATS)
 """What Pillow opens of a backdrop: what browsers show, too."""
+SRGB_GAMMA = 1 / 2.2
+"""What a PNG says whose values are sRGB, for those who know only its gAMA."""
+SAME_GAMMA = 0.05
+"""Gammas that differ by this share or less are the same, as libpng has it."""
 
 
 def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
@@ -27,8 +32,9 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
         PNG, JPEG, WebP, AVIF, GIF, TIFF, HEIC, EXR, Radiance HDR or camera RAW. Of a moving picture the first frame is
         decoded.
     transfer : str
-        How integers encode light. Colours with an ICC profile are converted to sRGB, unless this is ``linear``. RAW
-        and floats are linear light in any case, and that of an EXR is converted from the primaries that it names.
+        How integers encode light. Colours with an ICC profile, and PNGs of another gamma, are converted to sRGB,
+        unless this is ``linear``. RAW and floats are linear light in any case, and that of an EXR is converted from
+        the primaries that it names.
     memory : int
         Bytes that the decoded picture may take.
 
@@ -55,8 +61,13 @@ def decode_file(file: BinaryIO, transfer: Transfer, memory: int) -> Iterator[Cod
 
 
 def _to_srgb(data: bytes, pixels: Codes) -> Codes:
-    """Convert RGB to sRGB by the colour profile of the file, if it has one."""
-    profile = heif.profile(data) if heif.is_heif(data) else _profile(data)
+    """Convert a picture to sRGB by the colour profile of the file, if it has one, or by a PNG's gamma."""
+    if heif.is_heif(data):
+        profile, gamma = heif.profile(data), None
+    else:
+        profile, gamma = _profile_and_gamma(data)
+    if gamma:
+        return _gamma_to_srgb(pixels, gamma)
     if not profile or pixels.shape[2] < 3:
         return pixels
     colours = np.ascontiguousarray(pixels[..., :3])
@@ -71,8 +82,23 @@ def _to_srgb(data: bytes, pixels: Codes) -> Codes:
     return np.concatenate([converted, pixels[..., 3:]], axis=2)
 
 
-def _profile(data: bytes) -> bytes | None:
-    """The ICC profile of what Pillow opens."""
+def _gamma_to_srgb(pixels: Codes, gamma: float) -> Codes:
+    """Convert values that are light to the power of gamma."""
+    top = np.iinfo(pixels.dtype).max
+    light = (np.arange(top + 1, dtype=np.float32) / np.float32(top)) ** np.float32(1 / gamma)
+    codes = integer_formats.to_integers(from_light(light, "srgb"), pixels.dtype)
+    colours = 3 if pixels.shape[2] >= 3 else 1
+    return np.concatenate([codes[pixels[..., :colours]], pixels[..., colours:]], axis=2)
+
+
+def _profile_and_gamma(data: bytes) -> tuple[bytes | None, float | None]:
+    """The ICC profile of what Pillow opens, and the gamma of a PNG of which nothing better says what it has."""
     with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
+        profile, gamma = picture.info.get("icc_profile"), None
+        if picture.format == "PNG" and not profile and "srgb" not in picture.info:
+            gamma = picture.info.get("gamma")
+        # In the third edition of PNG cICP comes before all others. Pillow does not know it.
+        if not gamma or abs(gamma / SRGB_GAMMA - 1) < SAME_GAMMA or b"cICP" in data[: data.find(b"IDAT")]:
+            gamma = None
         # Pixels made from a palette or from inks do not have the colours that the profile describes.
-        return picture.info.get("icc_profile") if picture.mode in ("RGB", "RGBA", "I;16B", "RGB;16") else None
+        return profile if picture.mode in ("RGB", "RGBA", "I;16B", "RGB;16") else None, gamma

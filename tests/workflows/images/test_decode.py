@@ -1,7 +1,9 @@
 """Pictures of every format are decoded upright, as their orientation says."""
 
 import io
+import struct
 import tempfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from PIL import Image, ImageCms, ImageOps
 from storage.errors import ImageError
 from storage.layout.captures import Stack
 from workflows.images import camera_raw, decode, float_formats, integer_formats
+from workflows.images.tone_curves import to_light
 
 MEMORY = 1 << 20
 TAG = 274
@@ -73,6 +76,54 @@ def test_a_backdrop_is_upright_with_its_profile_and_its_transparency() -> None:
     seen = np.dstack([PIXELS, PIXELS[..., :1]])
     found = decode.decode(saved("PNG", 3, seen), "srgb", memory=MEMORY)
     np.testing.assert_array_equal(found, seen[::-1, ::-1])
+
+
+def with_chunks(png: bytes, *chunks: tuple[bytes, bytes]) -> bytes:
+    """A PNG with more chunks, after its header."""
+    made = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    ]
+    return png[:33] + b"".join(made) + png[33:]
+
+
+LINEAR = b"gAMA", struct.pack(">I", 100_000)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize("gamma", [1.0, 1 / 1.8])
+def test_a_png_of_another_gamma_is_converted_to_srgb(channels: int, gamma: float) -> None:
+    light = np.random.default_rng(1).random((6, 9, channels), np.float32)
+    png = integer_formats.encode_png(np.rint(light**gamma * 65535).astype(np.uint16))
+    marked = with_chunks(png, (b"gAMA", struct.pack(">I", round(gamma * 100_000))))
+    found = integer_formats.to_unit(decode.decode(marked, "srgb", memory=MEMORY))
+    colours = 3 if channels >= 3 else 1
+    np.testing.assert_allclose(to_light(found[..., :colours], "srgb"), light[..., :colours], atol=1e-4)
+    np.testing.assert_allclose(found[..., colours:], light[..., colours:] ** gamma, atol=1e-4)
+    as_it_is = decode.decode(marked, "linear", memory=MEMORY)
+    np.testing.assert_array_equal(as_it_is, decode.decode(png, "linear", memory=MEMORY))
+
+
+@pytest.mark.parametrize(
+    "chunks",
+    [
+        [(b"gAMA", struct.pack(">I", 45455))],
+        [(b"gAMA", struct.pack(">I", 0))],
+        [LINEAR, (b"sRGB", b"\0")],
+        [LINEAR, (b"cICP", bytes((1, 13, 0, 1)))],
+        [
+            LINEAR,
+            (
+                b"iCCP",
+                b"x\0\0" + zlib.compress(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()),
+            ),
+        ],
+    ],
+    ids=["2.2", "none", "sRGB", "cICP", "iCCP"],
+)
+def test_the_gamma_of_srgb_and_what_comes_before_gamma(chunks: list[tuple[bytes, bytes]]) -> None:
+    found = decode.decode(with_chunks(saved("PNG", 1), *chunks), "srgb", memory=MEMORY)
+    np.testing.assert_allclose(found, PIXELS, atol=1)  # a conversion from sRGB to sRGB rounds
 
 
 @pytest.mark.parametrize("turn", [0, 9, 65535])
