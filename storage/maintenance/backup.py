@@ -88,7 +88,7 @@ def back_up(
     _require_empty(target)
     try:
         with tempfile.TemporaryFile() as rows, tempfile.TemporaryFile() as entries:
-            copying = _Copying(engine, objects, target, rows, entries)
+            copying = _Copying(engine, target, rows, entries)
             with Examiner(objects, copying.take) as examiner:
                 families = copying.snapshot()
                 while families:
@@ -150,9 +150,7 @@ class _Copying:
         Copied so far.
     """
 
-    def __init__(
-        self, engine: Engine, objects: Objects, target: Objects, rows: IO[bytes], entries: IO[bytes]
-    ) -> None:
+    def __init__(self, engine: Engine, target: Objects, rows: IO[bytes], entries: IO[bytes]) -> None:
         self._engine, self._target = engine, target
         self._rows, self._entries = rows, entries
         self._of_family: list[dict[str, Any]] = []
@@ -234,10 +232,10 @@ class _Copying:
             if self._reread:
                 name, row = json.loads(line)
                 if inventory.family_of(name, row) in self._reread:
-                    if name == "jobs":
+                    if name in ("mattes", "jobs"):
                         replaced.add(row["id"])
                     continue
-                if name in ("tiles", "log") and row["job"] in replaced:
+                if name in row_dump.OF_ROWS and row[row_dump.OF_ROWS[name]] in replaced:
                     continue
             self.rows += 1
             yield line

@@ -93,7 +93,7 @@ def known_names(connection: Connection, folder: str, names: Collection[str]) -> 
 
 
 def family_of(table: str, row: Mapping[str, Any]) -> str | None:
-    """The family of a row, see `Item`; None for tables without one, such as tiles and log."""
+    """The family of a row, see `Item`; None for tables without one, such as tiles and links."""
     match table:
         case "captures" | "uploads":
             return str(row["id"])

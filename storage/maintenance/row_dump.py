@@ -35,6 +35,8 @@ from storage.database.tables import metadata
 from storage.errors import Conflict, InvalidInput
 
 SKIPPED = ("coordinator", "deliveries", "bodies")
+OF_ROWS = {"links": "matte", "tiles": "job", "log": "job"}
+"""Tables whose rows belong to those of another table, and the column that says to which."""
 BATCH = 500
 """Rows in memory at a time."""
 ID = re.compile("[A-Za-z0-9_-]{1,64}")
@@ -106,16 +108,19 @@ def lines_of_family(connection: Connection, tables: Mapping[str, Table], family:
     """The rows of a family, see `storage.maintenance.inventory.Item`."""
     captures, mattes, jobs = (tables[name] for name in ("captures", "mattes", "jobs"))
     uploads, parts = tables["uploads"], tables["upload_parts"]
+    of_mattes = or_(mattes.c.capture == family, mattes.c.id == family)
     of_jobs = or_(jobs.c.capture == family, (jobs.c.capture == "") & (jobs.c.matte == family))
+    ids = {"matte": select(mattes.c.id).where(of_mattes), "job": select(jobs.c.id).where(of_jobs)}
     for table, which in (
         (captures, captures.c.id == family),
-        (mattes, or_(mattes.c.capture == family, mattes.c.id == family)),
+        (mattes, of_mattes),
         (uploads, uploads.c.id == family),
         (parts, parts.c.upload == family),
         (jobs, of_jobs),
         *(
-            (tables[name], tables[name].c.job.in_(select(jobs.c.id).where(of_jobs)))
-            for name in ("tiles", "log")
+            (tables[name], tables[name].c[column].in_(ids[column]))
+            for name, column in OF_ROWS.items()
+            if name in tables  # an earlier revision has no links
         ),
     ):
         for row in connection.execute(select(table).where(which)).mappings():

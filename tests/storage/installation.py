@@ -12,7 +12,7 @@ from storage.layout import uploads as stored_uploads
 from storage.layout.captures import Stack, create_stack, write_slab
 from storage.layout.uploads import Part
 from storage.objects.store import Objects
-from storage.records import api_keys, captures, idempotency, jobs, mattes, programs, tiles, uploads
+from storage.records import api_keys, captures, idempotency, jobs, links, mattes, programs, tiles, uploads
 from tests.storage.layout.matte_blocks import block, extent, places
 
 SHAPE = (6, 21, 40, 3)
@@ -24,9 +24,9 @@ RETRYABLE = {"status": 500, "detail": "gave up"}
 def fill(engine: Engine, objects: Objects) -> None:
     """Fill an installation.
 
-    It has the capture ``c`` and its matte ``m``; ``i``, a capture that is being ingested from its archive; ``u``, an
-    unfinished upload; the composites ``v``, which is done, ``w``, which is queued, and ``x``, which has failed and may
-    be retried; ``l``, an imported matte; and ``r``, a matte that is being recovered.
+    It has the capture ``c`` and its matte ``m``, which has a link; ``i``, a capture that is being ingested from its
+    archive; ``u``, an unfinished upload; the composites ``v``, which is done, ``w``, which is queued, and ``x``, which
+    has failed and may be retried; ``l``, an imported matte; and ``r``, a matte that is being recovered.
     """
     rng = np.random.default_rng(3)
     create_stack(
@@ -95,6 +95,7 @@ def add_rows(c: Connection) -> None:
     captures.add(c, "i", "ii", name="", bytes=len(ARCHIVE), frames=6, program={}, seconds=1e6)
     mattes.add(c, "m", "c", "mr", {"method": "none"}, name="ball \u2713")
     mattes.change(c, "m", state="ready", figures={"width": 40})
+    links.create(c, "m", 1e6)
     mattes.add(c, "r", "c", "rr", {})
     mattes.add_imported(c, "l", {}, {"width": 40}, stored=9)
     uploads.add(c, "u", 3000, "filename x", 1e6, "once")

@@ -18,7 +18,7 @@ from storage.maintenance.backup import back_up
 from storage.maintenance.restore import restore
 from storage.maintenance.verify import verify
 from storage.objects.store import Objects
-from storage.records import captures, jobs, mattes
+from storage.records import captures, jobs, links, mattes
 from tests.parts.postgres import Server
 from tests.storage.installation import flip
 
@@ -61,6 +61,24 @@ def test_backup_while_items_are_deleted_and_finished(
                 assert composites.clip_path(row.id) in elsewhere[1].sizes(composites.path(row.id))
         if found["i"] == "ready":
             assert jobs.get(c, "ii").state == "succeeded"
+
+
+def test_links_of_a_family_that_changes_meanwhile_are_restored(
+    engine: Engine, filled: Objects, target: Objects, elsewhere: tuple[Engine, Objects]
+) -> None:
+    def meanwhile(share: float, size: int) -> None:
+        with writing(engine) as c:
+            if jobs.active_job(c, matte="r") is None:
+                return
+            jobs.cancel(c, "rr")
+            mattes.delete(c, "r")
+        filled.delete("mattes/r")
+
+    back_up(engine, filled, target, "1", meanwhile)
+    restore(target, *elsewhere)
+    with reading(elsewhere[0]) as c:
+        assert set(c.scalars(select(database_tables.mattes.c.id))) == {"l", "m"}
+        assert len(links.list_all(c, "m")) == 1
 
 
 @pytest.mark.slow
