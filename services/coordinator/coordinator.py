@@ -11,7 +11,7 @@ import socket
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from itertools import chain
@@ -47,6 +47,8 @@ POLL = 0.1
 """Seconds between two reads of the ledger. News from the cluster is handled at once."""
 BEAT = 2.0
 """Seconds between two heartbeats."""
+BATCH = 0.5
+"""Seconds after which no more jobs are started or cleaned up until the next poll: first the lease is renewed."""
 WRITE = 0.25
 """Seconds between two writes of progress, whatever the number of jobs and tiles."""
 DYING = 1.2
@@ -205,16 +207,16 @@ class Coordinator:
         with reading(self._engine) as c:
             active = {row.id: row for row in jobs.to_run(c)}
             cancelled = jobs.cancelled_with_leftovers(c)
-        for row in active.values():
-            if row.id in self._runs:
-                self._guarded(row.id, self._runs[row.id].follow, row)
-            elif not row.paused:
-                self._guarded(row.id, self._start, row)
         for job in self._runs.keys() - active.keys():
             self._drop(job)
-        for row in cancelled:
-            if row.kind in JOB_KINDS:  # otherwise a newer coordinator knows what is left of it
-                self._guarded(row.id, self._clean_up, row)
+        new = [row for row in active.values() if row.id not in self._runs and not row.paused]
+        for job, run in list(self._runs.items()):
+            self._guarded(job, run.follow, active[job])
+        for row in _batch(new):
+            self._guarded(row.id, self._start, row)
+        # Of other kinds, a newer coordinator knows what is left of them.
+        for row in _batch([row for row in cancelled if row.kind in JOB_KINDS]):
+            self._guarded(row.id, self._clean_up, row)
 
     def _guarded(self, job: str, act: Any, *arguments: Any) -> None:
         """Do something about a job, whose errors must not hold up other jobs."""
@@ -357,6 +359,15 @@ class Coordinator:
             run = self._runs[job]
             if not dispatcher.submit(run.kind.steps, run.task, each, run.trace):
                 run.to_do.extendleft(reversed([*chain.from_iterable(each)]))
+
+
+def _batch(rows: Sequence[Row[Any]]) -> Iterator[Row[Any]]:
+    """The first of some rows, one at least, until `BATCH` is over."""
+    begin = time.monotonic()
+    for row in rows:
+        yield row
+        if time.monotonic() - begin > BATCH:
+            return
 
 
 def _logged(act: Callable[..., None], *arguments: Any) -> None:

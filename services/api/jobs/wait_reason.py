@@ -48,7 +48,7 @@ def reason(connection: Connection, row: Row[Any], sign: Heartbeat | None) -> str
         if state == "ingesting":
             return f"its capture {row.capture} is being ingested"
     if row.state == "queued":
-        return "the coordinator starts it within a second"
+        return "the coordinator starts it soon"
     still = time.time() - row.moved_at
     if still > NO_PROGRESS:
         return f"no progress in the last {still:.0f} s: a tile takes long, or its worker does not answer"

@@ -3,6 +3,7 @@
 import re
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +251,36 @@ def test_recovery_takes_no_transaction_while_its_capture_is_ingested(
             captures.change(c, "c", state="ready")
         until(lambda: (recovery, PREPARE) in dispatcher.submitted)
     assert looked == [recovery]
+
+
+@pytest.mark.parametrize("what", ["start", "clean-up"])
+def test_lease_is_renewed_while_many_jobs_are_started_or_cleaned_up(
+    engine: Engine, objects: Objects, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    seen: list[str] = []
+    renew = leases.renew
+
+    def renewed(*arguments: Any) -> None:
+        seen.append("renewed")
+        renew(*arguments)
+
+    def observed(connection: Connection, row: Row[Any]) -> bool:
+        seen.append(row.id)
+        return True
+
+    monkeypatch.setattr(leases, "renew", renewed)
+    monkeypatch.setattr(JOB_KINDS["composite"], "is_due" if what == "start" else "cancelled", observed)
+    monkeypatch.setattr(coordinator, "BEAT", 0.0)
+    monkeypatch.setattr(coordinator, "BATCH", 0.0)
+    with writing(engine) as c:
+        many = [jobs.add(c, "composite", "", {}, "m") for _ in range(5)]
+        if what == "clean-up":
+            for job in many:
+                jobs.cancel(c, job)
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, Idle()):  # type: ignore[arg-type]
+        until(lambda: set(many) <= set(seen))
+    assert [one for one in seen if one != "renewed"] == many
+    assert all("renewed" in seen[seen.index(a) : seen.index(b)] for a, b in pairwise(many))
 
 
 def test_job_without_the_store_is_tried_again_and_says_so(

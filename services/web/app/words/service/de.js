@@ -228,7 +228,7 @@ export const de = {
 	"the changes before and after it are not visible, or not distinct from others": "die Wechsel davor und danach sind nicht zu sehen oder nicht von anderen zu unterscheiden",
 	"the clip is interlaced: each frame holds two pictures of different times, in alternate rows. Deinterlace it with a video editor, or by `ffmpeg -i clip.mts -vf bwdif clip.mp4`, and send the result": "der Clip ist im Zeilensprung: Jedes Bild enthält zwei von verschiedenen Zeiten, in abwechselnden Zeilen. Mit einem Schnittprogramm oder durch `ffmpeg -i clip.mts -vf bwdif clip.mp4` umwandeln und das Ergebnis senden",
 	"the colours of the glass are finer than its frames store them, at half the resolution: that alone limits composites to about {limit} dB": "die Farben des Glases sind feiner, als seine Bilder sie mit halber Auflösung speichern: Das allein begrenzt Montagen auf etwa {limit} dB",
-	"the coordinator starts it within a second": "der Koordinator startet ihn binnen einer Sekunde",
+	"the coordinator starts it soon": "der Koordinator startet ihn bald",
 	"the dark and bright constant patterns are not both found": "dunkle und helle einfarbige Muster sind nicht beide zu finden",
 	"the database cannot be reached or is busy; try again in a few seconds": "die Datenbank ist nicht erreichbar oder überlastet; in ein paar Sekunden erneut versuchen",
 	"the disk is full, apart from a reserve for what is under way: delete captures, mattes or uploads, or free space on the disk, and try again; everything stored before is kept": "die Platte ist voll bis auf eine Reserve für das, was läuft: Aufnahmen, Matten oder Uploads löschen oder Platz auf der Platte schaffen und erneut versuchen; alles Gespeicherte bleibt",
