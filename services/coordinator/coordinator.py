@@ -213,7 +213,7 @@ class Coordinator:
         for job, run in list(self._runs.items()):
             self._guarded(job, run.follow, active[job])
         for row in _batch(new):
-            self._guarded(row.id, self._start, row)
+            self._guarded(row.id, self._start, row.id)
         # Of other kinds, a newer coordinator knows what is left of them.
         for row in _batch([row for row in cancelled if row.kind in JOB_KINDS]):
             self._guarded(row.id, self._clean_up, row)
@@ -243,9 +243,10 @@ class Coordinator:
                     ),
                 )
 
-    def _start(self, row: Row[Any]) -> None:
+    def _start(self, job: str) -> None:
         """Start a job if what it needs is there; raises if it never will be."""
         with reading(self._engine) as c:
+            row = jobs.get(c, job)
             if not JOB_KINDS[row.kind].is_due(c, row):
                 return
         with self._writing() as c:

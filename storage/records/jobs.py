@@ -80,11 +80,14 @@ def get(connection: Connection, job: str) -> Row[Any]:
 
 
 def to_run(connection: Connection) -> Sequence[Row[Any]]:
-    """Active jobs, oldest first, apart from recoveries that wait for the ingest of their capture."""
+    """Active jobs, oldest first, apart from recoveries that wait for the ingest of their capture.
+
+    Only their ``id``, ``paused`` and ``region``: they may be many, and their plans large.
+    """
     ingesting = select(captures.c.id).where(captures.c.state == "ingesting")
     waits = (jobs.c.state == "queued") & (jobs.c.kind == "recover") & jobs.c.capture.in_(ingesting)
-    query = select(jobs).where(jobs.c.state.in_(ACTIVE), ~waits).order_by(jobs.c.number)
-    return connection.execute(query).all()
+    query = select(*(jobs.c[name] for name in ("id", "paused", "region"))).order_by(jobs.c.number)
+    return connection.execute(query.where(jobs.c.state.in_(ACTIVE), ~waits)).all()
 
 
 def active_job(connection: Connection, **about: str) -> str | None:

@@ -44,7 +44,7 @@ def test_lists_and_lookups_show_only_the_owners_rows(filled: Engine) -> None:
             assert found is not None
             assert found.owner == owner
     with reading(filled) as c:
-        assert [row.owner for row in jobs.to_run(c)] == list(OWNERS)
+        assert [row.id for row in jobs.to_run(c)] == [f"{owner}-job" for owner in OWNERS]
     with reading(for_owner(filled, NOBODY)) as c:
         assert jobs.active_job(c, capture="alice-capture") is None
 
