@@ -318,8 +318,7 @@ class Coordinator:
         with self._writing() as c:
             JOB_KINDS[row.kind].cancelled(c, row)
             jobs.clear_leftovers(c, row.id)
-        dying = DYING if row.started_at else 0
-        self._discards.append((time.monotonic() + dying, row))
+        self._discards.append((time.monotonic() + DYING, row))
 
     def _discard(self) -> None:
         """Remove the files of ended jobs on which no worker works any more."""

@@ -274,7 +274,8 @@ class JobRun:
     def _prepared(self, connection: Connection, plan: dict[str, Any]) -> Next:
         tile_records.add_plan(connection, self.job, plan)
         row = jobs.get(connection, self.job)
-        tracing.past_span("queue", row.trace, row.created_at, row.started_at, job=self.job, kind=row.kind)
+        queued_at = row.queued_at or row.created_at
+        tracing.past_span("queue", row.trace, queued_at, row.started_at, job=self.job, kind=row.kind)
         self.kind.prepared(connection, self.task, plan)
         for line in plan.get("notes", ()):
             jobs.log(connection, self.job, line)

@@ -126,6 +126,7 @@ jobs = Table(
     Column("leftovers", Boolean, nullable=False, server_default=false()),  # see `storage.records.jobs.end`
     Column("paused", Boolean, nullable=False, server_default=false()),
     Column("region", JSON(none_as_null=True)),  # x, y, width and height of what is recovered first
+    Column("queued_at", Float),  # when it was last retried
     Index("jobs_by_state", "state", "leftovers"),
     Index("jobs_by_owner_and_state", "owner", "state", "number"),
     Index("jobs_by_kind", "kind", "state", "stored", "total", "done", "failed"),

@@ -200,7 +200,7 @@ def cancel(connection: Connection, job: str) -> None:
 
 
 def retry(connection: Connection, job: str, *, replan: bool = False, trace: str | None = None) -> None:
-    """Queue a failed job again; its done tiles stay done.
+    """Queue a failed job again; its done tiles stay done. The time since it failed is neither of its queue nor its run.
 
     Parameters
     ----------
@@ -230,6 +230,7 @@ def retry(connection: Connection, job: str, *, replan: bool = False, trace: str 
     )
     done = (tiles.c.job == job, tiles.c.tile >= 0, tiles.c.state == "done")
     values = {"state": "queued", "stage": "waiting", "failed": 0, "problem": None, "finished_at": None}
+    values |= {"queued_at": time.time(), "started_at": None}
     values["trace"] = trace or row.trace
     values["row_bytes"] = jobs.c.row_bytes + ROW  # the log goes on
     values["done"] = connection.scalar(select(func.count()).where(*done))

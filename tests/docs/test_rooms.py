@@ -6,6 +6,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 MOST = 12
 UNCOUNTED = {"__init__.py", "__pycache__", "py.typed", "README.md"}
+GROWING = {"storage/database/migrations/versions"}
+"""Has one entry for each revision of the schema, and none is ever removed."""
 
 
 def test_no_folder_has_more_than_a_dozen_entries() -> None:
@@ -16,4 +18,4 @@ def test_no_folder_has_more_than_a_dozen_entries() -> None:
         if "__pycache__" not in folder
     }
     assert len(counts) > 50
-    assert {folder: count for folder, count in counts.items() if count > MOST} == {}
+    assert {folder for folder, count in counts.items() if count > MOST} <= GROWING

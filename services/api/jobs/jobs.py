@@ -98,7 +98,10 @@ class Tiles(BaseModel):
 
 
 class Job(BaseModel):
-    """A job; `name` is that of its matte, or else of its capture, and empty once they are deleted."""
+    """A job; `name` is that of its matte, or else of its capture, and empty once they are deleted.
+
+    Of a job that was retried, `started_at`, `queued_seconds` and `run_seconds` are those since then.
+    """
 
     id: str
     kind: Literal["ingest", "recover", "composite"]
@@ -144,6 +147,7 @@ class Job(BaseModel):
         now = time.time()
         # Not below zero: the clock may go back.
         ran = max((row.finished_at or now) - row.started_at, 0.0) if row.started_at else 0.0
+        queued_at = row.queued_at or row.created_at
         running = row.state == "running"
         # The step after the last tile counts as one more tile, so only a job that has succeeded is at 1.
         progress = 1.0 if row.state == "succeeded" else row.done / (row.total + 1) if row.total else 0.0
@@ -159,7 +163,7 @@ class Job(BaseModel):
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
             eta_seconds=seconds_left(connection, row, now) if running else None,
             waits_for=reason(connection, row, sign),
-            queued_seconds=max((row.started_at or row.finished_at or now) - row.created_at, 0.0),
+            queued_seconds=max((row.started_at or row.finished_at or now) - queued_at, 0.0),
             run_seconds=ran,
             workers=len(sign.cluster["workers"]) if running and sign else 0,
             options=row.options,
