@@ -35,8 +35,9 @@ def delete_expired(connection: Connection) -> list[str]:
         (tables.captures, "ingesting", (captures.path, stored_uploads.path)),
         (tables.mattes, "recovering", (mattes.path,)),
     ):
-        used = tables.jobs.c["capture" if table is tables.captures else "matte"]
-        busy = select(used).where(tables.jobs.c.state.in_(jobs.ACTIVE), used.is_not(None))
+        what = "capture" if table is tables.captures else "matte"
+        used = tables.jobs.c[what]
+        busy = select(used).where(jobs.is_in_use(what), used.is_not(None))
         over = (table.c.expires_at <= time.time(), table.c.state != making, table.c.id.not_in(busy))
         some = select(table.c.id).where(*over).limit(MOST)
         found = connection.scalars(delete(table).where(table.c.id.in_(some)).returning(table.c.id))

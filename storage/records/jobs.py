@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Row, func, insert, select, update
 
 from storage.database.owners import NOBODY
 from storage.database.rows import ROW, find, new_id
@@ -91,9 +91,15 @@ def to_run(connection: Connection) -> Sequence[Row[Any]]:
 
 
 def active_job(connection: Connection, **about: str) -> str | None:
-    """The oldest active job of a ``capture`` or a ``matte``; None if there is none."""
-    query = select(jobs.c.id).filter_by(**about).where(jobs.c.state.in_(ACTIVE))
+    """The oldest active job that uses a ``capture`` or a ``matte``; None if there is none."""
+    query = select(jobs.c.id).filter_by(**about).where(is_in_use(*about))
     return connection.scalar(query.order_by(jobs.c.number).limit(1))
+
+
+def is_in_use(what: str) -> ColumnElement[bool]:
+    """The condition that an active job uses its ``capture`` or its ``matte``; a composite uses its matte alone."""
+    active = jobs.c.state.in_(ACTIVE)
+    return active & (jobs.c.kind != "composite") if what == "capture" else active
 
 
 def names(connection: Connection, rows: Sequence[Row[Any]]) -> dict[str, str]:

@@ -162,6 +162,10 @@ def test_active_job_of_a_capture_or_a_matte(connection: Connection) -> None:
     jobs.end(connection, first, "succeeded")
     assert jobs.active_job(connection, capture="new") == second
     assert jobs.active_job(connection, matte="a") is None
+    jobs.end(connection, second, "succeeded")
+    composite = jobs.add(connection, "composite", "new", {}, matte="b")
+    assert jobs.active_job(connection, matte="b") == composite
+    assert jobs.active_job(connection, capture="new") is None  # which it does not read
 
 
 def test_only_cancelled_job_has_leftovers(connection: Connection) -> None:
