@@ -22,6 +22,8 @@ logger = logging.getLogger(__name__)
 
 POLL = 0.5
 """Seconds between two queries for deliveries that are due."""
+LONGEST = 200
+"""Characters of an error in a job's log: it may quote what the receiver answered."""
 THREADS = 8
 """Requests at once, so that one slow receiver does not hold up the others."""
 
@@ -113,7 +115,7 @@ class Sender:
             status = safe_http.post(row.url, body, headers, private=self._private)
             accepted, outcome = 200 <= status < 300, f"answered with {status}"
         except (OSError, http.client.HTTPException, ValueError) as error:
-            accepted, outcome = False, f"no answer: {error}"
+            accepted, outcome = False, f"no answer: {str(error)[:LONGEST]}"
         try:
             with writing(self._engine) as c:
                 if accepted:

@@ -13,6 +13,9 @@ from storage.errors import NotFound
 ROW = 1000
 """Bytes that a row of a capture, matte, job or upload takes, with what an attempt at a job logs."""
 
+PAUSE = 200
+"""Bytes that the two lines take that are logged when a job pauses and continues."""
+
 
 def new_id() -> str:
     """A random, URL-safe id that cannot be guessed."""

@@ -122,7 +122,7 @@ jobs = Table(
     Column("stored", BigInteger),  # bytes in the store, of a composite
     Index("jobs_by_owner", "owner", "number"),
     Column("webhook", Text),  # URL to notify when the job has ended
-    Column("row_bytes", BigInteger, nullable=False, server_default="0"),  # of the plan
+    Column("row_bytes", BigInteger, nullable=False, server_default="0"),  # of the plan and the log
     Column("leftovers", Boolean, nullable=False, server_default=false()),  # see `storage.records.jobs.end`
     Column("paused", Boolean, nullable=False, server_default=false()),
     Column("region", JSON(none_as_null=True)),  # x, y, width and height of what is recovered first

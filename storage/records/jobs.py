@@ -12,7 +12,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Row, func, insert, select, update
 
 from storage.database.owners import NOBODY
-from storage.database.rows import ROW, find, new_id
+from storage.database.rows import PAUSE, ROW, find, json_bytes, new_id
 from storage.database.tables import captures, jobs, mattes, tiles
 from storage.database.tables import log as lines
 from storage.errors import Conflict
@@ -154,7 +154,8 @@ def pause(connection: Connection, job: str, paused: bool) -> None:
     row = require_active(connection, job)
     if row.paused != paused:
         # Its pace is measured again: the pause is no part of it.
-        change(connection, job, paused=paused, moved_at=time.time(), paced_at=None)
+        values = {"paused": paused, "moved_at": time.time(), "paced_at": None}
+        change(connection, job, **values, row_bytes=jobs.c.row_bytes + (PAUSE if paused else 0))
         log(connection, job, "paused" if paused else "continued")
 
 
@@ -225,10 +226,10 @@ def retry(connection: Connection, job: str, *, replan: bool = False, trace: str 
     row = get(connection, job)
     if row.state != "failed":
         raise Conflict(f"job {job} is {row.state}; only a failed job can be retried")
-    if replan:
+    if replan and row.plan is not None:
         connection.execute(tiles.delete().where(tiles.c.job == job))
-        nothing = {"plan": None, "total": 0, "pixels": 0, "row_bytes": 0}
-        connection.execute(update(jobs).where(jobs.c.id == job).values(nothing))
+        row_bytes = jobs.c.row_bytes - json_bytes(row.plan)
+        change(connection, job, plan=None, total=0, pixels=0, row_bytes=row_bytes)
     connection.execute(
         update(tiles)
         .where(tiles.c.job == job, tiles.c.state != "done")

@@ -36,7 +36,7 @@ def add_plan(connection: Connection, job: str, plan: dict[str, Any]) -> None:
     connection.execute(
         update(jobs)
         .where(jobs.c.id == job)
-        .values(plan=plan, total=plan["tiles"], row_bytes=json_bytes(plan))
+        .values(plan=plan, total=plan["tiles"], row_bytes=jobs.c.row_bytes + json_bytes(plan))
     )
 
 

@@ -335,6 +335,8 @@ def change_job(context: OwnerContext, id: str, change: Annotated[JobChange, Depe
                 )
             jobs.change(c, id, region=change.region.stored)
         if change.paused is not None:
+            if change.paused and not row.paused:
+                admit(c, context.settings)  # its log grows; to continue is never refused
             jobs.pause(c, id, change.paused)
         return Job.read(c, id)
 

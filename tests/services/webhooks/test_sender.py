@@ -1,5 +1,7 @@
 """Which coordinator sends webhooks, and what happens to those that are not accepted."""
 
+import socket
+import threading
 import time
 
 import pytest
@@ -82,6 +84,24 @@ def test_nothing_is_sent_to_an_address_that_is_not_public(engine: Engine) -> Non
             == "webhook, attempt 1: no answer: 127.0.0.1 is at 127.0.0.1, which is not public; again in 5 s"
         )
         assert found.received == []
+
+
+def test_long_answer_of_a_receiver_is_logged_in_part(engine: Engine) -> None:
+    token = lease(engine)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            with server.accept()[0] as connection:
+                connection.recv(1 << 16)
+                connection.sendall(b"x" * 60_000 + b"\r\n\r\n")
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with Sender(settings(), engine, lambda: token):
+            line = wait_for_log(engine, ended(engine, f"http://127.0.0.1:{server.getsockname()[1]}/"))
+        thread.join()
+    assert "no answer: xxxx" in line
+    assert len(line) < 300
 
 
 @pytest.mark.slow

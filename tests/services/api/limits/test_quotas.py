@@ -16,7 +16,7 @@ from services.api.limits.quotas import UNITS
 from services.settings import Settings
 from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import for_owner
-from storage.database.rows import ROW, json_bytes
+from storage.database.rows import PAUSE, ROW, json_bytes
 from storage.database.tables import uploads
 from storage.objects.store import Objects
 from storage.records import api_keys, captures, jobs, mattes, tiles
@@ -268,6 +268,28 @@ def test_rows_count_as_stored(serve: Serve, archive: bytes, engine: Engine) -> N
     assert create(serve(owner_bytes=10_000), 1).status_code == 507
     assert client.delete(f"/v1/jobs/{made.json()['job']}").status_code == 204
     assert used(client)["owner_bytes"] == 0
+
+
+def test_pauses_count_as_stored(serve: Serve, archive: bytes, engine: Engine) -> None:
+    made = serve().post("/v1/captures", content=archive, headers=ZIP)
+    job, before = made.json()["job"], len(archive) + rows_of(made)
+    client = serve(owner_bytes=before + PAUSE)
+
+    def pause(paused: bool) -> Any:
+        return client.patch(f"/v1/jobs/{job}", json={"paused": paused})
+
+    answers = [pause(paused).status_code for paused in (True, True, False, True, False)]
+    assert answers == [200] * 5
+    assert used(client)["owner_bytes"] == before + 2 * PAUSE
+    refused(pause(True), 507, "owner_bytes", before + PAUSE, before + 2 * PAUSE)
+    plan = {"tiles": 5, "memory": 1}
+    with writing(engine) as c:
+        tiles.add_plan(c, job, plan)
+    assert used(client)["owner_bytes"] == before + 2 * PAUSE + json_bytes(plan) + 5 * TILE
+    with writing(engine) as c:
+        jobs.end(c, job, "failed", {"detail": "", "status": 500})
+        jobs.retry(c, job, replan=True)
+    assert used(client)["owner_bytes"] == before + 2 * PAUSE + ROW
 
 
 def test_frames_of_a_capture(serve: Serve, archive: bytes, tmp_path: Path) -> None:
