@@ -5,7 +5,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, select
 
-from storage import statistics
+from services.api.jobs.situation import Situation
 from storage.database.tables import jobs
 from storage.layout.blocks import block_edge
 from storage.records import leases
@@ -16,7 +16,7 @@ STEPS = 1.0
 """Seconds that a recovery takes beside those of its pixels: to prepare, and to finish."""
 
 
-def seconds_left(connection: Connection, row: Row[Any], now: float) -> float | None:
+def seconds_left(row: Row[Any], now: float, situation: Situation) -> float | None:
     """Seconds until a running job has succeeded; None until the pace of its tiles is known.
 
     Parameters
@@ -26,7 +26,7 @@ def seconds_left(connection: Connection, row: Row[Any], now: float) -> float | N
     """
     if not row.total or row.paused:
         return None
-    finishing = _finishing(connection, row) if row.kind == "ingest" else 0.0
+    finishing = _finishing(row, situation) if row.kind == "ingest" else 0.0
     if row.done == row.total:
         elapsed = now - row.stage_at if row.stage == "finishing" else 0.0
         return max(finishing - elapsed, 0.0)
@@ -48,7 +48,7 @@ def seconds_to_recover(connection: Connection, capture: Row[Any]) -> dict[str, f
     return {name: STEPS + seconds / min(workers, blocks) for name, seconds in plan["core_seconds"].items()}
 
 
-def _finishing(connection: Connection, row: Row[Any]) -> float:
+def _finishing(row: Row[Any], situation: Situation) -> float:
     """Seconds that an ingest will take after its last tile, for the report on the capture.
 
     It uses the median speed of the last few ingests: the first one on a machine compiles its kernels, and others may
@@ -56,7 +56,7 @@ def _finishing(connection: Connection, row: Row[Any]) -> float:
     """
     ended = [
         (plan, seconds)
-        for plan, seconds in statistics.recent_ingests(connection, limit=16)
+        for plan, seconds in situation.recent_ingests
         if plan.get("video") == row.plan.get("video")
     ]
     speeds = [TYPICAL, *(seconds / _report_work(plan) for plan, seconds in ended[:4])]

@@ -18,6 +18,7 @@ from services.api.http.responses import json_response, utc_time
 from services.api.http.router import Router, in_turn
 from services.api.http.types import After, Limit
 from services.api.jobs.eta import seconds_left
+from services.api.jobs.situation import Situation
 from services.api.jobs.wait_reason import reason
 from services.api.limits.quotas import admit
 from services.coordinator.job_kinds import JOB_KINDS
@@ -28,8 +29,7 @@ from storage.database.rows import new_id, page
 from storage.database.tables import jobs as table
 from storage.errors import Conflict, OptionError
 from storage.layout import composites
-from storage.records import captures, jobs, leases, mattes
-from storage.records.leases import Heartbeat
+from storage.records import captures, jobs, mattes
 from workflows.mattes.options import describe_options, parse_options
 from workflows.programs.program import Program
 
@@ -135,16 +135,16 @@ class Job(BaseModel):
     @classmethod
     def of(cls, connection: Connection, rows: Iterable[Row[Any]]) -> Iterator["Job"]:
         """Jobs by their rows, of which few are in memory at a time: a plan may be large."""
-        sign = leases.last_heartbeat(connection)
+        situation = Situation(connection)
         rows = iter(rows)
         while some := list(islice(rows, ROWS_AT_ONCE)):
             names = jobs.names(connection, some)
             for row in some:
-                yield cls._of(connection, row, names[row.id], sign)
+                yield cls._of(row, names[row.id], situation)
 
     @classmethod
-    def _of(cls, connection: Connection, row: Row[Any], name: str, sign: Heartbeat | None) -> "Job":
-        now = time.time()
+    def _of(cls, row: Row[Any], name: str, situation: Situation) -> "Job":
+        now, sign = time.time(), situation.heartbeat
         # Not below zero: the clock may go back.
         ran = max((row.finished_at or now) - row.started_at, 0.0) if row.started_at else 0.0
         queued_at = row.queued_at or row.created_at
@@ -161,8 +161,8 @@ class Job(BaseModel):
             capture=row.capture or None,  # the composite of an imported matte has none
             progress=progress,
             tiles=Tiles(total=row.total, done=row.done, failed=row.failed),
-            eta_seconds=seconds_left(connection, row, now) if running else None,
-            waits_for=reason(connection, row, sign),
+            eta_seconds=seconds_left(row, now, situation) if running else None,
+            waits_for=reason(row, situation),
             queued_seconds=max((row.started_at or row.finished_at or now) - queued_at, 0.0),
             run_seconds=ran,
             workers=len(sign.cluster["workers"]) if running and sign else 0,

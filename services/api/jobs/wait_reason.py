@@ -3,11 +3,9 @@
 import time
 from typing import Any
 
-from sqlalchemy import Connection, Row, func, select
+from sqlalchemy import Row
 
-from storage.database.owners import across_owners
-from storage.database.tables import captures
-from storage.database.tables import jobs as table
+from services.api.jobs.situation import Situation
 from storage.records import jobs
 from storage.records.leases import Heartbeat
 
@@ -32,29 +30,26 @@ def trouble_of(sign: Heartbeat | None) -> str | None:
     return problem
 
 
-def reason(connection: Connection, row: Row[Any], sign: Heartbeat | None) -> str | None:
+def reason(row: Row[Any], situation: Situation) -> str | None:
     """Why an active job waits; None if it does not wait, or has ended."""
     if row.state not in jobs.ACTIVE:
         return None
     if row.paused:
         return "it is paused, and does what is left once it is continued"
+    sign = situation.heartbeat
     trouble = trouble_of(sign)
     if trouble is not None:
         return trouble
     if sign is not None and row.id in sign.cluster.get("without_store", ()):
         return "its tiles cannot reach the store"
-    if row.kind == "recover":
-        state = connection.scalar(select(captures.c.state).where(captures.c.id == row.capture))
-        if state == "ingesting":
-            return f"its capture {row.capture} is being ingested"
     if row.state == "queued":
+        if row.kind == "recover" and row.capture in situation.ingesting:
+            return f"its capture {row.capture} is being ingested"
         return "the coordinator starts it soon"
     still = time.time() - row.moved_at
     if still > NO_PROGRESS:
         return f"no progress in the last {still:.0f} s: a tile takes long, or its worker does not answer"
-    query = select(func.count()).where(table.c.state == "running", table.c.id != row.id)
-    others = connection.scalar(across_owners(query))
-    if others:
+    if others := situation.running - 1:
         workers = len(sign.cluster["workers"]) if sign else 0
         return f"it shares {workers} workers with {others} other jobs"
     return None

@@ -4,15 +4,15 @@
 
 Makes a capture and a matte, writes copies of their rows into the database, one capture and one matte for ten jobs,
 and prints how long the service takes to start on it, and before on an empty folder, the longest of three answers to
-each call, and which share of a core the service takes while nobody asks for anything. Run it from the root of the
-repository.
+each call, and which share of a core the service takes while nobody asks for anything. Last, it queues 2,000 recoveries
+and prints how long lists of jobs take then. Run it from the root of the repository.
 """
 
 import argparse
 import json
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
@@ -25,8 +25,10 @@ from sqlalchemy import Engine, Table, insert, select
 from storage.database import tables
 from storage.database.engine import open_engine, reading, writing
 from storage.database.rows import new_id
+from storage.records import jobs, mattes
 from tests.end_to_end.conftest import Service, serving
 from tests.parts import postgres
+from tests.parts.waiting import until
 from workflows.programs.presets import preset
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
@@ -34,6 +36,8 @@ from workflows.simulation.scene import write_capture
 YEAR = 365 * 86400.0
 IDLE = 20.0
 """Seconds of watching the service without a request."""
+ACTIVE = 2000
+"""Recoveries that are queued at once."""
 STATES = ("succeeded",) * 7 + ("failed", "cancelled", "cancelled")
 """Of ten composites."""
 PATHS = (
@@ -44,14 +48,13 @@ PATHS = (
     "/v1/mattes",
     "/v1/mattes?limit=1000",
     "/v1/mattes?name=of+no+matte",
+    "/v1/mattes?capture={capture}",
     "/v1/mattes/{matte}",
     "/v1/jobs",
     "/v1/jobs?limit=1000",
     "/v1/jobs?limit=1000&after={last}",
     "/v1/jobs?state=running",
     "/v1/jobs?state=failed",
-    "/v1/jobs?capture={capture}",
-    "/v1/jobs?matte={matte}",
     "/v1/jobs/{job}",
     "/v1/programs",
     "/v1/limits",
@@ -96,6 +99,7 @@ def main() -> None:
             found["start"] = time.monotonic() - began
             found |= dict(timed(service, archive))
             share = idle_share(service)
+            found |= busy(service, url, capture["id"])
     for call, seconds in found.items():
         print(f"{call:50} {seconds:7.3f} s")
     print(f"idle: {share:.3f} of a core")
@@ -153,17 +157,17 @@ def fill(engine: Engine, count: int) -> None:
                 c.execute(insert(table), [row for group in some for row in group[table]])
 
 
-def calls(http: httpx2.Client) -> Iterator[tuple[str, list[float]]]:
+def calls(http: httpx2.Client, paths: Sequence[str] = PATHS) -> Iterator[tuple[str, list[float]]]:
     """Each call that reads rows, and the seconds until each of three answers."""
     captures = http.get("/v1/captures").json()
-    jobs = http.get("/v1/jobs?limit=1000").json()
+    listed = http.get("/v1/jobs?limit=1000").json()["jobs"]
     ids = {
         "capture": captures["captures"][0]["id"],
         "matte": http.get("/v1/mattes").json()["mattes"][0]["id"],
-        "job": jobs["jobs"][0]["id"],
-        "last": jobs["jobs"][-1]["id"],
+        "job": listed[0]["id"],
+        "last": listed[-1]["id"],
     }
-    for path in PATHS:
+    for path in paths:
         took = []
         for _ in range(3):
             began = time.monotonic()
@@ -188,6 +192,22 @@ def timed(service: Service, archive: Path) -> Iterator[tuple[str, float]]:
     began = time.monotonic()
     assert http.delete(f"/v1/captures/{uploaded['id']}").is_success
     yield "deleting the capture", time.monotonic() - began
+
+
+def busy(service: Service, url: str, capture: str) -> dict[str, float]:
+    """The longest of three answers to lists of jobs while very many are queued or running."""
+    engine = open_engine(url)
+    with writing(engine) as c:
+        options = jobs.get(
+            c, c.scalar(select(tables.mattes.c.job).where(tables.mattes.c.capture == capture))
+        ).options
+        for _ in range(ACTIVE):
+            matte = new_id()
+            mattes.add(c, matte, capture, jobs.add(c, "recover", capture, options, matte), options)
+    engine.dispose()
+    until(lambda: service.http.get("/v1/jobs?state=running").json()["jobs"])
+    paths = ("/v1/jobs?limit=1000", "/v1/jobs?limit=1000&state=queued", "/v1/jobs?limit=1000&state=running")
+    return {f"{call}, of {ACTIVE} active": max(took) for call, took in calls(service.http, paths)}
 
 
 def idle_share(service: Service) -> float:

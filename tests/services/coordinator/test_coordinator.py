@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, Engine, Row
 
+from services.api.jobs.situation import Situation
 from services.api.jobs.wait_reason import reason
 from services.cluster.dispatcher import Outcome
 from services.coordinator import coordinator, job_run
@@ -294,7 +295,7 @@ def test_job_without_the_store_is_tried_again_and_says_so(
         assert time.monotonic() - begin > 3 * job_run.HOLD
         time.sleep(3 * coordinator.BEAT)
         with reading(engine) as c:
-            waits_for = reason(c, jobs.get(c, job), leases.last_heartbeat(c))
+            waits_for = reason(jobs.get(c, job), Situation(c))
     assert waits_for is not None
     assert "cannot reach the store" in waits_for
 

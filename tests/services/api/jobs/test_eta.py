@@ -6,6 +6,7 @@ import pytest
 from sqlalchemy import Connection, Engine, update
 
 from services.api.jobs.eta import STEPS, TYPICAL, seconds_left, seconds_to_recover
+from services.api.jobs.situation import Situation
 from storage.database import rows, tables
 from storage.database.engine import writing
 from storage.records import captures, jobs, leases, tiles
@@ -37,7 +38,7 @@ def ended(connection: Connection, finishing: float, plan: dict[str, Any] = PLAN)
 
 
 def left(connection: Connection, job: str, now: float) -> float | None:
-    return seconds_left(connection, jobs.get(connection, job), now)
+    return seconds_left(jobs.get(connection, job), now, Situation(connection))
 
 
 def test_recovery_continues_at_its_pace(engine: Engine) -> None:

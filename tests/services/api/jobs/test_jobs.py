@@ -1,12 +1,15 @@
 """What the API says about jobs, from the rows of a database."""
 
 import time
+from typing import Any
 
-from sqlalchemy import Engine
+from sqlalchemy import Engine, event
 
 from services.api.jobs.jobs import Job
-from storage.database.engine import writing
-from storage.records import jobs
+from storage.database.engine import reading, writing
+from storage.database.rows import page
+from storage.database.tables import jobs as table
+from storage.records import captures, jobs, leases, tiles
 
 
 def test_retried_job_counts_seconds_from_the_retry_on(engine: Engine) -> None:
@@ -25,3 +28,42 @@ def test_retried_job_counts_seconds_from_the_retry_on(engine: Engine) -> None:
     assert (queued.started_at, queued.run_seconds) == (None, 0.0)
     assert running.started_at is not None
     assert max(queued.queued_seconds, running.queued_seconds, running.run_seconds) < 60
+
+
+def test_page_of_jobs_takes_as_many_queries_as_a_job_of_each_kind(engine: Engine) -> None:
+    def add(number: int) -> None:
+        """Add a recovery that waits for an ingest, one that runs, and an ingest that runs."""
+        with writing(engine) as c:
+            ingest = jobs.add(c, "ingest", f"new-{number}", {})
+            captures.add(c, f"new-{number}", ingest, name="", bytes=1, frames=1, program={})
+            jobs.add(c, "recover", f"new-{number}", {}, f"m-{number}")
+            for job in (ingest, jobs.add(c, "recover", "ready", {}, f"n-{number}")):
+                jobs.enter_stage(c, job, "preparing")
+                tiles.add_plan(c, job, {"tiles": 2, "frames": 1, "width": 8, "height": 8})
+                tiles.start_pace(c, job, after=0)
+
+    def read() -> tuple[list[Job], int]:
+        queries.clear()
+        with reading(engine) as c:
+            found = list(Job.of(c, page(c, table, 100, None)))
+        return found, len(queries)
+
+    queries: list[Any] = []
+    with writing(engine) as c:
+        captures.add(c, "ready", "", name="", bytes=1, frames=1, program={})
+        captures.change(c, "ready", state="ready")
+        token = leases.acquire(c, "here")
+        assert token is not None
+        leases.renew(c, token, {"workers": ["a", "b"], "problem": None})
+    event.listen(engine, "before_cursor_execute", lambda *arguments: queries.append(arguments))
+    add(0)
+    one_each, few = read()
+    assert [job.waits_for for job in one_each] == [
+        "it shares 2 workers with 1 other jobs",
+        "its capture new-0 is being ingested",
+        "it shares 2 workers with 1 other jobs",
+    ]
+    for number in range(1, 6):
+        add(number)
+    found, many = read()
+    assert (len(found), many) == (18, few)
