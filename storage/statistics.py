@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, Text, cast, func, select
+from sqlalchemy import Connection, Row, Select, func, select
 
 from storage.database.dialects import clock
 from storage.database.owners import across_owners
@@ -100,7 +100,7 @@ def received_bytes(connection: Connection, *, all_owners: bool = False) -> int:
         select(func.sum(func.coalesce(mattes.c.stored, 0) + ROW)),
         select(func.sum(func.coalesce(jobs.c.stored, 0) + jobs.c.row_bytes + jobs.c.total * TILE + ROW)),
         select(func.sum(uploads.c.offset + uploads.c.parts * PART + func.length(uploads.c.metadata) + ROW)),
-        select(func.sum(func.length(cast(programs.c.program, Text)))),
+        select(func.sum(programs.c.row_bytes)),
         select(func.sum(bodies.c.bytes)).where(under_way()),
     ]
     return sum(_sum(connection, one, all_owners) for one in sums)

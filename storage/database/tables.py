@@ -76,6 +76,7 @@ mattes = Table(
     Column("stored", BigInteger),  # as for a capture
     Column("name", Text, nullable=False, server_default=text("''")),
     Index("mattes_by_owner", "owner", "number"),
+    Index("mattes_by_capture", "capture", "owner", "number"),
     Index("mattes_by_state", "state"),
     Index("mattes_by_size", "stored", "state", "owner"),
 )
@@ -90,7 +91,9 @@ programs = Table(
     Column("showing", JSON(none_as_null=True)),  # playback progress, as the player last reported it
     _owner(),
     UniqueConstraint("owner", "id"),  # the id is a hash of the program, so two owners may share it
+    Column("row_bytes", BigInteger, nullable=False, server_default="0"),  # of the program
     Index("programs_by_owner", "owner", "number"),
+    Index("programs_by_size", "owner", "row_bytes"),
 )
 
 jobs = Table(

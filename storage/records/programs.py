@@ -7,22 +7,23 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
 
-from storage.database.rows import find
+from storage.database.rows import find, json_bytes
 from storage.database.tables import programs as table
 
 
 def add(connection: Connection, program: dict[str, Any]) -> str:
     """Add a program and return its id; an identical program has the same id and is stored once."""
     id = _id(program)
-    if added_bytes(connection, program):
-        connection.execute(insert(table).values(id=id, program=program, created_at=time.time()))
+    if size := added_bytes(connection, program):
+        row = {"id": id, "program": program, "created_at": time.time(), "row_bytes": size}
+        connection.execute(insert(table).values(row))
     return id
 
 
 def added_bytes(connection: Connection, program: dict[str, Any]) -> int:
     """Bytes that adding a program would take, as `statistics.stored_bytes` counts them; 0 if it is already stored."""
     known = connection.scalar(select(table.c.id).where(table.c.id == _id(program))) is not None
-    return 0 if known else len(json.dumps(program))
+    return 0 if known else json_bytes(program)
 
 
 def _id(program: dict[str, Any]) -> str:

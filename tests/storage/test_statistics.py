@@ -16,7 +16,7 @@ from storage.database.tables import jobs as table
 from storage.maintenance import inventory
 from storage.records import jobs
 
-MANY = ("captures", "mattes", "jobs", "tiles", "log")
+MANY = ("captures", "mattes", "jobs", "tiles", "log", "programs")
 """Tables that grow with all that a service has done."""
 
 QUERIES: dict[str, Callable[[Connection], Any]] = {
@@ -74,4 +74,18 @@ def test_no_query_reads_or_sorts_all_rows(name: str, owner: str | None, tmp_path
         or ("page" in name and "ORDER BY" in step)
     ]
     assert slow == []
+    engine.dispose()
+
+
+def test_mattes_of_a_capture_are_found_without_the_owners_others(tmp_path: Path) -> None:
+    engine = open_engine(f"sqlite:///{tmp_path}/some.db")
+    seen: list[tuple[str, Any]] = []
+    with reading(for_owner(engine, "somebody")) as c:
+        event.listen(
+            engine, "before_cursor_execute", lambda c, cursor, sql, values, *_: seen.append((sql, values))
+        )
+        list(page(c, mattes, 100, None, capture="c"))
+        sql, values = seen[-1]
+        ((*_, step),) = c.connection.execute(f"EXPLAIN QUERY PLAN {sql}", values)
+    assert "mattes_by_capture" in step
     engine.dispose()

@@ -1,5 +1,6 @@
 """Schema migrations: databases of every age end with the same tables and keep their rows."""
 
+import json
 import sqlite3
 import subprocess
 import sys
@@ -18,11 +19,13 @@ from storage.database import dialects, migrations
 from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import DEFAULT, for_owner
 from storage.database.revision import NEWEST, revision
+from storage.database.rows import json_bytes
 from storage.database.tables import coordinator, metadata, tiles, totals
 from storage.errors import Conflict, NotFound, Unavailable
 from storage.layout.uploads import Part
 from storage.records import captures, idempotency, jobs, mattes, programs, uploads
 from storage.records import tiles as tile_records
+from storage.statistics import stored_bytes
 from tests.parts.postgres import Server
 
 BEFORE_REVISIONS = Path(__file__).with_name("before_revisions.sql")
@@ -328,4 +331,19 @@ def test_mattes_before_names_are_named_after_their_captures(bare: Engine) -> Non
     with reading(engine) as connection:
         names = {id: mattes.get(connection, id).name for id in ("m", "of a deleted capture", "imported")}
     assert names == {"m": "ball", "of a deleted capture": "", "imported": ""}
+    engine.dispose()
+
+
+def test_programs_before_their_sizes_are_counted(bare: Engine) -> None:
+    program = {"parts": ["x" * 1000]}
+    with writing(bare) as connection:
+        migrations.upgrade(connection, "0013")
+        connection.execute(
+            text("INSERT INTO programs (id, program, created_at) VALUES ('p', :program, 1000.5)"),
+            {"program": json.dumps(program)},
+        )
+    engine = open_engine(bare.url.render_as_string(hide_password=False))
+    with reading(engine) as connection:
+        assert programs.get(connection, "p").row_bytes == json_bytes(program)
+        assert stored_bytes(connection) == json_bytes(program)
     engine.dispose()
