@@ -331,8 +331,14 @@ class Coordinator:
         """Remove the files of a job, now or later: on a busy machine a worker may take long to end."""
         try:
             JOB_KINDS[row.kind].remove_files(self._objects, row)
-        except Exception:
-            logger.warning("the files of job %s are removed in %g s", row.id, AGAIN, exc_info=True)
+        except Exception as error:
+            logger.warning(
+                "the files of job %s are removed in %g s: %s",
+                row.id,
+                AGAIN,
+                error,
+                exc_info=not isinstance(error, EnvmatteError),
+            )
             self._discards.append((time.monotonic() + AGAIN, row))
 
     def _submit(self) -> None:
@@ -374,5 +380,7 @@ def _logged(act: Callable[..., None], *arguments: Any) -> None:
     """Run something whose errors are logged and stop nothing else; it is tried again later."""
     try:
         act(*arguments)
+    except EnvmatteError as error:
+        logger.warning("housekeeping is tried again later: %s", error.detail)
     except Exception:
         logger.exception("housekeeping failed; it is tried again later")

@@ -30,6 +30,15 @@ UNREACHABLE = re.compile(
     r"HTTP error(: [a-z ]+)?|status code: (429|5\d\d)|error sending request|response body"
 )
 """In messages of obstore for a bucket that does not answer, or answers with a server error; they have no own class."""
+REFUSED = (
+    re.compile(
+        r"<Code>(NoSuchBucket|AccessDenied|InvalidAccessKeyId|SignatureDoesNotMatch|RequestTimeTooSkewed|ExpiredToken|"
+        r"InvalidToken|AuthorizationHeaderMalformed)</Code>"
+    ),
+    re.compile(r"status code: (40[13] \w+)"),  # in answer to HEAD, which has no code
+    re.compile("(incorrectly configured region)"),
+)
+"""The same for a bucket that does not exist or does not accept the keys; a missing object is none of them."""
 
 
 @contextmanager
@@ -43,7 +52,7 @@ def translate_errors() -> Iterator[None]:
     FileNotFoundError
         If the folder of an object is removed while it is written.
     StoreUnavailable
-        If a bucket, or a service, does not answer.
+        If a bucket, or a service, does not answer or refuses all requests.
     """
     try:
         yield
@@ -53,6 +62,11 @@ def translate_errors() -> Iterator[None]:
             raise NoRoom(DISK_FULL) from error
         if f"(os error {errno.ENOENT})" in str(error):
             raise FileNotFoundError(errno.ENOENT, message) from error
+        refused = next(filter(None, (pattern.search(str(error)) for pattern in REFUSED)), None)
+        if refused is not None:
+            raise StoreUnavailable(
+                f"the store refuses: {refused[1]}; check its bucket's name and region, its keys and the clock"
+            ) from error
         found = [match[0] for match in UNREACHABLE.finditer(message)]
         if message.startswith(("Generic S3 error", "Generic HTTP error")) and found:
             # No more than that: the message goes on with the bucket's answer.

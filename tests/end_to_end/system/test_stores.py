@@ -1,13 +1,15 @@
-"""A cluster on a bucket makes the same bytes as a single machine on a folder."""
+"""A cluster on a bucket makes the same bytes as a single machine on a folder; a bucket that refuses is named."""
 
 from pathlib import Path
 
 import pytest
 
+from services.client import Busy, _transport
 from services.runtime import certificates
 from storage.objects.store import Objects
 from tests.end_to_end.conftest import Service, digests, serving
 from tests.parts.rig import stored
+from tests.parts.waiting import until
 from tests.services.cluster.clusters import address, started
 
 
@@ -36,3 +38,19 @@ def test_matte_is_the_same_in_a_bucket_and_in_a_folder(
             assert not (tmp_path / "data" / "store").exists()
             assert remote.http.delete(f"/v1/mattes/{made}").status_code == 204
             assert made not in objects.names("mattes")
+
+
+def test_a_store_that_refuses_is_named_to_all_who_ask(
+    capture_archive: Path, s3: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_transport, "PATIENCE", 1.0)
+    where = ("--store", s3.replace("envmatte", "another"), "--workers", "1")
+    with serving(tmp_path / "data", *where) as service:
+        ready = service.http.get("/readyz")
+        assert (ready.status_code, ready.json()["database"]) == (503, "ok")
+        assert ready.json()["store"].startswith("the store refuses: NoSuchBucket;")
+        with pytest.raises(Busy, match="the store refuses: NoSuchBucket;") as refused:
+            service.client.upload(capture_archive)
+        assert refused.value.retry_after == 2
+        until(lambda: "housekeeping is tried again later: the store refuses" in service.log())
+        assert "Traceback" not in service.log()

@@ -5,6 +5,7 @@ import shutil
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 import zarr
 
-from storage.errors import NoRoom, Unavailable
+from storage.errors import NoRoom, StoreUnavailable, Unavailable
 from storage.objects import store as module
 from storage.objects.byte_objects import PART
 from storage.objects.event_loop import gather
@@ -37,31 +38,41 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "REQUESTS", module.REQUESTS | {"timeout": timedelta(seconds=1)})
 
 
-@pytest.fixture(params=["refused", "silent", "503", "429"])
-def unreachable(
-    impatient: None, request: pytest.FixtureRequest, s3: str, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[str]:
-    """The URL of a store whose bucket does not answer, or answers with an error."""
+@contextmanager
+def _answering(status: int, body: bytes) -> Iterator[str]:
+    """The URL of a server that answers everything with an error."""
 
-    class Busy(BaseHTTPRequestHandler):
+    class Refusing(BaseHTTPRequestHandler):
         def _refuse(self) -> None:
-            self.send_response(int(request.param))
-            self.send_header("Content-Length", str(len(ANSWER)))
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             if self.command != "HEAD":
-                self.wfile.write(ANSWER)
+                self.wfile.write(body)
 
         do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = _refuse
 
         def log_message(self, format: str, *args: object) -> None:
             pass
 
-    if request.param in ("503", "429"):
-        with ThreadingHTTPServer(("127.0.0.1", 0), Busy) as server:
-            threading.Thread(target=server.serve_forever).start()
-            monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
-            yield s3
+    with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+        threading.Thread(target=server.serve_forever).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
             server.shutdown()
+
+
+@pytest.fixture(params=["refused", "silent", "503", "429"])
+def unreachable(
+    impatient: None, request: pytest.FixtureRequest, s3: str, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[str]:
+    """The URL of a store whose bucket does not answer, or answers with an error."""
+
+    if request.param in ("503", "429"):
+        with _answering(int(request.param), ANSWER) as url:
+            monkeypatch.setenv("AWS_ENDPOINT_URL", url)
+            yield s3
         return
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -143,11 +154,44 @@ def test_service_that_does_not_answer_is_unavailable(impatient: None) -> None:
             Objects(f"http://127.0.0.1:{taken.getsockname()[1]}/v1").get(["mattes/m/zarr/zarr.json"])
 
 
-def test_missing_bucket_is_not_reported_as_unavailable(s3: str) -> None:
+def test_missing_bucket_is_named_by_every_call_that_writes_or_lists(s3: str) -> None:
     objects = Objects(s3.replace("envmatte", "another"))
-    with pytest.raises(Exception, match="NoSuchBucket") as caught:
-        objects.check_reachable()
-    assert not isinstance(caught.value, Unavailable)
+    requests: list[Callable[[], object]] = [
+        objects.check_reachable,
+        objects.clock,
+        lambda: objects.put("a", b"1"),
+        lambda: stream(objects, "a", b"1"),
+        lambda: stream(objects, "a", bytes(PART + 1)),
+        lambda: objects.written_at("a"),
+        lambda: gather(objects.put_array("a", np.zeros(3))),
+    ]
+    for request in requests:
+        with pytest.raises(
+            StoreUnavailable, match="the store refuses: NoSuchBucket; check its bucket's name"
+        ):
+            request()
+
+
+@pytest.mark.parametrize(
+    ("status", "code"),
+    [(403, "InvalidAccessKeyId"), (403, "SignatureDoesNotMatch"), (401, "Unknown"), (400, "ExpiredToken")],
+)
+def test_refused_keys_are_named_without_retrying(
+    status: int, code: str, s3: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with _answering(status, f"<Error><Code>{code}</Code></Error>".encode()) as url:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", url)
+        objects = Objects(s3)
+        for request in (objects.check_reachable, objects.clock, lambda: objects.read_raw("a")):
+            with pytest.raises(StoreUnavailable, match=f"the store refuses: ({code}|401 Unauthorized);"):
+                request()
+
+
+def test_missing_object_of_a_bucket_is_no_refusal(s3: str) -> None:
+    with pytest.raises(FileNotFoundError):
+        Objects(s3).read_raw("a")
+    with pytest.raises(FileNotFoundError):
+        Objects(s3).read("a")
 
 
 @pytest.mark.parametrize("piece", [1 << 18, 9 << 20, 2 * DISK], ids=["crumbs", "parts", "at once"])
