@@ -196,11 +196,17 @@ class CoordinatorSettings(ClusterSettings):
         from sqlalchemy.exc import ArgumentError
 
         try:
-            known = make_url(value).get_backend_name() in ("sqlite", "postgresql")
+            url = make_url(value)
         except ArgumentError:
-            known = False
-        if not known:  # without showing the URL, which may hold a password
-            raise ValueError("give it as postgresql://USER:PASSWORD@HOST/NAME or sqlite:////FILE")
+            kind = file = ""
+        else:
+            kind, file = url.get_backend_name(), url.database or ""
+        if (
+            kind == "sqlite" and not Path(file).is_absolute()
+        ):  # SQLite would make a database in memory or wherever
+            raise ValueError("must name its file from the root on, with four slashes: sqlite:////FILE")
+        if kind not in ("sqlite", "postgresql"):  # without showing the URL, which may hold a password
+            raise ValueError("must be postgresql://USER:PASSWORD@HOST/NAME or sqlite:////FILE")
         return value
 
     @field_validator("store")

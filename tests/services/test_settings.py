@@ -1,5 +1,6 @@
 """The settings: from the environment, and what they refuse."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -144,10 +145,13 @@ def test_workers_elsewhere_need_a_shared_store(certificates: Path) -> None:
         {"store": "file://shared/store"},
         {"database": "mysql://me:secret@host/name"},
         {"database": "envmatte.db"},
+        {"database": "sqlite://"},
+        {"database": "sqlite:///:memory:"},
+        {"database": "sqlite:///envmatte.db"},
     ],
 )
 def test_stores_and_databases_of_other_kinds_are_refused(wrong: dict[str, str]) -> None:
     with pytest.raises(ValidationError, match=next(iter(wrong))) as caught:
         Settings(**wrong)
-    assert "give it as" in caught.value.errors()[0]["msg"]
+    assert re.search("give it as|must be postgresql:|sqlite:////FILE", caught.value.errors()[0]["msg"])
     assert "secret" not in caught.value.errors()[0]["msg"]
