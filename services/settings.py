@@ -37,10 +37,14 @@ def _setting(default: Any, description: str, *, unset: str = "", **constraints: 
     return Field(**made, description=description, json_schema_extra={"unset": unset}, **constraints)
 
 
+LEAST_MEMORY = 300_000_000
+"""Bytes that a worker needs: one that is idle has 150 MB and more, and was ended and started again without end."""
+
+
 def _memory_per_worker(settings: dict[str, Any]) -> int:
     from distributed.system import MEMORY_LIMIT
 
-    return int(MEMORY_LIMIT // settings["workers"])
+    return max(int(MEMORY_LIMIT // settings["workers"]), LEAST_MEMORY)
 
 
 class DataSettings(BaseModel):
@@ -92,10 +96,20 @@ class ClusterSettings(SchedulerSettings):
     )
     worker_memory: int = _setting(
         _memory_per_worker,
-        "Bytes of memory a worker process may use before it is ended and started again; 0 sets no limit.",
+        "Bytes of memory a worker process may use before it is ended and started again, 300 MB at least; 0 sets no "
+        "limit.",
         unset="the machine's memory divided by the workers",
         ge=0,
     )
+
+    @field_validator("worker_memory")
+    @classmethod
+    def _check_worker_memory(cls, value: int) -> int:
+        if 0 < value < LEAST_MEMORY:
+            raise ValueError(
+                f"must be {LEAST_MEMORY} bytes or more, or 0 for no limit: an idle worker has half of it"
+            )
+        return value
 
     @model_validator(mode="after")
     def _check_trusted(self) -> "ClusterSettings":

@@ -277,9 +277,13 @@ class Dispatcher:
         except Exception as error:
             return {"workers": [], "problem": f"the scheduler does not answer: {error!r}"}
         workers = [_worker(address, found) for address, found in sorted(info["workers"].items())]
-        problem = (
-            None if workers else "no worker is connected to the scheduler; start some with `envmatte worker`"
-        )
+        problem = None
+        if not workers:
+            problem = (
+                "no worker is connected to the scheduler; start some with `envmatte worker`"
+                if self._scale is None
+                else "no worker is running; the service starts its workers itself, and if this lasts, its log says why"
+            )
         under_way = sum(len(flight.tiles) for flight in list(self._flights.values()))
         return {"workers": workers, "under_way": under_way, "problem": problem}
 

@@ -59,11 +59,24 @@ def test_special_characters_of_a_path_are_escaped_in_its_url(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"port": 70000}, {"workers": 0}, {"ingest_memory": 5}, {"attempts": 0}, {"log": "xml"}]
+    "wrong",
+    [
+        {"port": 70000},
+        {"workers": 0},
+        {"worker_memory": 150_000_000},
+        {"ingest_memory": 5},
+        {"attempts": 0},
+        {"log": "xml"},
+    ],
 )
 def test_values_out_of_range_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValidationError, match=next(iter(wrong))):
         Settings(**wrong)
+
+
+def test_workers_have_what_they_need_by_default_or_no_limit() -> None:
+    assert Settings(workers=100_000).worker_memory == 300_000_000
+    assert Settings(worker_memory=0).worker_memory == 0
 
 
 @pytest.fixture(scope="module")

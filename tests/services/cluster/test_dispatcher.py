@@ -138,6 +138,16 @@ def test_a_missing_scheduler_is_reported_as_a_problem() -> None:
         dispatcher.drop("a")
 
 
+def test_a_cluster_of_its_own_without_workers_is_not_told_to_start_some() -> None:
+    with (
+        LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=None) as empty,
+        Dispatcher(lambda: Client(empty, set_as_default=False), "file:///store", lambda tiles: None) as own,
+        Dispatcher(lambda: Client(empty, set_as_default=False), "file:///store") as foreign,
+    ):
+        until(lambda: "no worker is running; the service starts" in own.cluster["problem"])
+        until(lambda: "start some with `envmatte worker`" in foreign.cluster["problem"])
+
+
 def test_keys_are_read_back() -> None:
     assert read_key(key_of("recover", "0ab1", -2)) == ("0ab1", -2)
     assert read_key(key_of("ingest", "0ab1", 12)) == ("0ab1", 12)

@@ -173,6 +173,7 @@ export const de = {
 	"no two frames of it are alike: it was too short, or something moved": "keine zwei Bilder davon gleichen sich: Es war zu kurz, oder etwas hat sich bewegt",
 	"no two frames show it whole": "keine zwei Bilder zeigen es ganz",
 	"no worker is connected to the scheduler; start some with `envmatte worker`": "kein Worker ist mit dem Scheduler verbunden; welche mit `envmatte worker` starten",
+	"no worker is running; the service starts its workers itself, and if this lasts, its log says why": "kein Worker läuft; der Dienst startet seine Worker selbst, und wenn das andauert, nennt sein Log den Grund",
 	"noise of {black} grey levels of 8 bits at black, {full} at full scale; white minus black is {ratio} times that of a pixel between them": "Rauschen von {black} Graustufen (8 Bit) bei Schwarz, {full} bei Weiß; der Abstand von Weiß zu Schwarz ist {ratio}-mal so groß wie das Rauschen dazwischen",
 	"not measured": "nicht gemessen",
 	"nothing changes in the video: film the monitor while it shows the program": "im Video ändert sich nichts: den Monitor filmen, während er das Programm zeigt",
