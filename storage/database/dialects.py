@@ -174,6 +174,11 @@ def translate(error: SQLAlchemyError) -> EnvmatteError | None:
     return None
 
 
+def is_refused(error: DBAPIError) -> bool:
+    """Whether PostgreSQL refuses a statement because its user lacks the right."""
+    return getattr(error.orig, "sqlstate", None) == "42501"
+
+
 def reason(error: BaseException | None) -> str:
     """The first line of a driver's error message, which contains no password."""
     message = str(error.orig if isinstance(error, DBAPIError) else error)

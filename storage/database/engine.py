@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from sqlalchemy import Connection, Engine, event
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import ProgrammingError, SQLAlchemyError
 
 from storage.database import dialects, owners
 from storage.database.revision import NEWEST, revision
-from storage.errors import Unavailable
+from storage.errors import InvalidInput, Unavailable
 
 
 def open_engine(url: str) -> Engine:
@@ -22,7 +22,7 @@ def open_engine(url: str) -> Engine:
     Raises
     ------
     InvalidInput
-        If the URL does not name a SQLite or PostgreSQL database.
+        If the URL does not name a SQLite or PostgreSQL database, or its user may not make tables there.
     Conflict
         If a newer envmatte has used the database.
     Unavailable
@@ -42,9 +42,14 @@ def open_engine(url: str) -> Engine:
                 migrations.upgrade(connection)
     except BaseException as error:
         engine.dispose()
+        where = dialects.display_url(engine.url)
+        if isinstance(error, ProgrammingError) and dialects.is_refused(error):
+            raise InvalidInput(
+                f"cannot set up the database {where}: {dialects.reason(error)}; let its user own the database"
+            ) from error
         if not isinstance(error, Unavailable):
             raise
-        where, why = dialects.display_url(engine.url), dialects.reason(error.__cause__)
+        why = dialects.reason(error.__cause__)
         raise Unavailable(
             f"cannot open the database {where}: {why}; check that it runs and that its URL is right, and try again"
         ) from error

@@ -12,7 +12,7 @@ from sqlalchemy.exc import IntegrityError
 
 from storage.database.engine import open_engine, reading, writing
 from storage.database.tables import metadata
-from storage.errors import Unavailable
+from storage.errors import InvalidInput, Unavailable
 from storage.records import jobs, tiles
 from tests.parts.postgres import Server
 
@@ -127,6 +127,16 @@ def test_unreachable_database_is_reported_without_password(url: str) -> None:
     while error is not None:
         assert "secret" not in str(error)
         error = error.__cause__
+
+
+def test_user_without_rights_is_told_to_own_the_database(postgresql_server: Server) -> None:
+    postgresql_server.execute("CREATE ROLE guest LOGIN")
+    with postgresql_server.database() as url:
+        with pytest.raises(InvalidInput, match="let its user own the database") as caught:
+            open_engine(url.replace("postgres@", "guest:secret@"))
+        assert "guest:***@/test_" in caught.value.detail
+        assert "permission denied" in caught.value.detail
+    postgresql_server.execute("DROP ROLE guest")
 
 
 def test_pool_recovers_from_server_restart(postgresql: str, postgresql_server: Server) -> None:
