@@ -15,7 +15,7 @@ from distributed import get_worker
 
 from services.runtime import tracing
 from services.runtime.logs import about
-from storage.errors import EnvmatteError, InvalidInput
+from storage.errors import EnvmatteError, InvalidInput, NoRoom, StoreUnavailable
 from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from workflows import jobs
@@ -66,7 +66,9 @@ def _run(tile: int, steps: Steps, store: str, task: Task, trace: str | None) -> 
             seconds, result = jobs.run(steps, _objects(store), task, tile)
         except EnvmatteError as error:
             if not isinstance(error, InvalidInput):  # the caller's fault is for the job to tell
-                logger.warning("failed: %s", error.detail, exc_info=True)
+                # With a full disk, or without a store, every tile fails, and the text says why.
+                expected = isinstance(error, NoRoom | StoreUnavailable)
+                logger.warning("failed: %s", error.detail, exc_info=not expected)
             # Sent back without its cause: an error of a library may not be picklable, and would take this one with it.
             error.__cause__ = error.__context__ = None
             raise

@@ -1,0 +1,35 @@
+"""What a worker logs about steps that fail."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from services.cluster import task as module
+from storage.errors import Corrupt, EnvmatteError, InvalidInput, NoRoom, StoreUnavailable
+from storage.objects.store import Objects
+from workflows.jobs import Task
+from workflows.mattes.steps import STEPS
+from workflows.untrusted.limits import Limits
+
+
+@pytest.mark.parametrize(
+    ("error", "logged"),
+    [(NoRoom, [None]), (StoreUnavailable, [None]), (Corrupt, [Corrupt]), (InvalidInput, [])],
+)
+def test_only_what_its_text_does_not_explain_has_a_traceback(
+    error: type[EnvmatteError],
+    logged: list[type[EnvmatteError] | None],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def work(objects: Objects, task: Task, tile: int) -> int:
+        raise error("for a reason")
+
+    task = Task("a", "none", "none", {}, Limits(1 << 30, 1 << 26))
+    with caplog.at_level(logging.INFO, "services.cluster.task"), pytest.raises(error):
+        module._run(0, replace(STEPS, work=work), tmp_path.as_uri(), task, None)
+    raised = [record.exc_info[0] if record.exc_info else None for record in caplog.records]
+    assert raised == logged
+    assert all("for a reason" in record.getMessage() for record in caplog.records)
