@@ -21,13 +21,12 @@ from services.runtime.logs import configure_logging
 from services.runtime.signals import run_until_signal
 from services.settings import ClusterSettings
 from storage.errors import InvalidInput
+from storage.outage import Outage
 
 logger = logging.getLogger(__name__)
 
 PAUSE = 1.0
 """Seconds between two attempts to join, and between two checks that a worker process is alive."""
-SAY = 30.0
-"""Seconds between two log lines about a scheduler that does not answer."""
 
 
 def work(settings: ClusterSettings, host: str | None) -> None:
@@ -73,7 +72,7 @@ class _Workers:
         self._settings = settings
         self._host = host
         self._looking = asyncio.Lock()
-        self._said_at = -SAY
+        self._outage = Outage(logger)
         self._ending = False
 
     @asynccontextmanager
@@ -109,14 +108,10 @@ class _Workers:
                 try:
                     await reach(self._scheduler, self._security, "worker")
                 except OSError as error:
-                    if time.monotonic() - self._said_at >= SAY:
-                        logger.warning("waiting for the scheduler at %s: %s", self._scheduler, error)
-                        self._said_at = time.monotonic()
+                    self._outage.goes_on("waiting for the scheduler at %s: %s", self._scheduler, error)
                     await asyncio.sleep(PAUSE)
                 else:
-                    if self._said_at > 0:
-                        logger.info("the scheduler at %s answers", self._scheduler)
-                        self._said_at = -SAY
+                    self._outage.is_over("the scheduler at %s answers", self._scheduler)
                     return
 
     async def _run_nanny(self, scratch: str) -> None:

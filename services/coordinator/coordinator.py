@@ -38,6 +38,7 @@ from storage.database.engine import reading, writing
 from storage.errors import EnvmatteError, GaveUp, NoRoom, Unavailable
 from storage.maintenance.inventory import GRACE_SECONDS
 from storage.objects.store import Objects
+from storage.outage import Outage
 from storage.records import jobs, leases, tiles
 from storage.records.leases import Superseded
 
@@ -85,6 +86,7 @@ class Coordinator:
         self._discards: list[tuple[float, Row[Any]]] = []
         """Jobs whose files are to be removed: the earliest time, and the job's row."""
         self._troubles: Counter[str] = Counter()
+        self._full = Outage(logger)
         self._beat_at = self._deleted_at = self._swept_at = self._wrote_at = self._read_at = -1e9
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="coordinator")
@@ -117,11 +119,14 @@ class Coordinator:
             try:
                 if self._leads():
                     self._step()
+                self._full.is_over("the database has room again")
             except Superseded as error:
                 logger.warning("%s: %s", self._name, error)
                 self._stand_down()
-            except (Unavailable, NoRoom) as error:
-                logger.warning("trying again in a second: %s", error.detail)
+            except Unavailable:  # logged by `storage.database`
+                self._stopped.wait(1)
+            except NoRoom as error:
+                self._full.goes_on("trying again every second: %s", error.detail)
                 self._stopped.wait(1)
             except Exception:  # nothing may end this thread
                 logger.exception("the coordinator continues after an error")

@@ -86,8 +86,8 @@ class Sender:
                 continue
             try:
                 self._send_due(token)
-            except (Unavailable, NoRoom, Superseded) as error:
-                logger.warning("webhooks wait: %s", error)
+            except (Unavailable, NoRoom, Superseded):  # which the coordinator and `storage.database` log
+                pass
             except Exception:  # nothing may end this thread
                 logger.exception("webhooks continue after an unexpected error")
 

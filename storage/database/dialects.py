@@ -23,8 +23,10 @@ from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
 from storage.errors import DISK_FULL, Conflict, EnvmatteError, InvalidInput, NoRoom, Unavailable
+from storage.outage import Outage
 
-logger = logging.getLogger(__name__)
+outage = Outage(logging.getLogger(__name__))
+"""Of the database of this process, whose errors are logged here and nowhere else: what they say is not for callers."""
 
 WRITE_LOCK = int.from_bytes(b"envmatte")
 """Number of the PostgreSQL advisory lock that every writing transaction holds."""
@@ -150,6 +152,7 @@ def _begin(connection: Connection) -> None:
 def translate(error: SQLAlchemyError) -> EnvmatteError | None:
     """The error of `storage.errors` that a database error stands for; None if it is a programming error."""
     if isinstance(error, NoConnectionFree):
+        outage.goes_on("all database connections are in use: %s", reason(error))
         return Unavailable("all database connections are in use; try again in a few seconds")
     if not isinstance(error, DBAPIError):
         return None
@@ -169,7 +172,7 @@ def translate(error: SQLAlchemyError) -> EnvmatteError | None:
     if full:
         return NoRoom(DISK_FULL)
     if unavailable:
-        logger.warning("the database cannot be reached: %s", reason(error))
+        outage.goes_on("the database cannot be reached: %s", reason(error))
         return Unavailable("the database cannot be reached or is busy; try again in a few seconds")
     return None
 

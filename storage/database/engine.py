@@ -99,3 +99,4 @@ def _translate_errors() -> Iterator[None]:
         if translated is None:
             raise
         raise translated from error
+    dialects.outage.is_over("the database answers")

@@ -161,4 +161,4 @@ def test_full_disk_can_be_left_by_calls(tmp_path: Path, capture_archive: Path) -
             until(lambda: not (disk / "data/store/uploads" / made["id"]).exists())
             assert shutil.disk_usage(disk).free > usage.free
         until(lambda: service.http.get("/readyz").status_code == 200)
-        assert "trying again in a second" not in (disk / "data.log").read_text()
+        assert "trying again every second" not in (disk / "data.log").read_text()

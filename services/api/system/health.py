@@ -48,7 +48,8 @@ class Readiness(BaseModel):
 class Check:
     """A check of something that the service depends on, in a thread of its own, and only if somebody asks."""
 
-    def __init__(self, check: Callable[[], str]) -> None:
+    def __init__(self, name: str, check: Callable[[], str]) -> None:
+        self._name = name
         self._check = check
         self._last: str | None = None
         self._began = 0.0
@@ -77,7 +78,8 @@ class Check:
             unsaid = f"{type(error).__name__}; the log of the service has more"
             found = error.detail if isinstance(error, EnvmatteError) else unsaid
             if found != self._last:
-                logger.warning("not ready: %s", found, exc_info=not isinstance(error, EnvmatteError))
+                exc_info = not isinstance(error, EnvmatteError)
+                logger.warning("not ready: %s: %s", self._name, found, exc_info=exc_info)
             return found
 
 
@@ -105,7 +107,7 @@ def checks(engine: Engine, objects: Objects) -> dict[str, Check]:
     def cluster() -> str:
         return trouble_of(last_heartbeat()) or "ok"
 
-    return {check.__name__: Check(check) for check in (database, store, cluster)}
+    return {check.__name__: Check(check.__name__, check) for check in (database, store, cluster)}
 
 
 @router.get("/healthz")

@@ -1,5 +1,6 @@
 """Opening a database, and transactions: concurrent, interrupted, too slow, or without a server."""
 
+import logging
 import signal
 import subprocess
 import sys
@@ -10,9 +11,11 @@ import pytest
 from sqlalchemy import Engine, text, update
 from sqlalchemy.exc import IntegrityError
 
+from storage.database import dialects
 from storage.database.engine import open_engine, reading, writing
 from storage.database.tables import metadata
 from storage.errors import InvalidInput, Unavailable
+from storage.outage import Outage
 from storage.records import jobs, tiles
 from tests.parts.postgres import Server
 
@@ -139,6 +142,28 @@ def test_user_without_rights_is_told_to_own_the_database(postgresql_server: Serv
     postgresql_server.execute("DROP ROLE guest")
 
 
+def test_an_absent_server_is_logged_when_it_goes_and_when_it_is_back(
+    postgresql: str,
+    postgresql_server: Server,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(dialects, "outage", Outage(logging.getLogger("storage.database.dialects")))
+    engine = open_engine(postgresql)
+    with caplog.at_level(logging.INFO, "storage"):
+        with postgresql_server.stopped():
+            for _ in range(5):
+                with pytest.raises(Unavailable), reading(engine):
+                    pass
+        for _ in range(2):
+            with reading(engine):
+                pass
+    engine.dispose()
+    away, back = [record.getMessage() for record in caplog.records]
+    assert away.startswith("the database cannot be reached: ")
+    assert back == "the database answers"
+
+
 def test_pool_recovers_from_server_restart(postgresql: str, postgresql_server: Server) -> None:
     engine = open_engine(postgresql)
     with writing(engine) as connection:
@@ -174,6 +199,7 @@ def test_server_stop_rolls_back_transaction(postgresql: str, postgresql_server: 
 HOLD = """
 import sys
 from sqlalchemy import text
+from storage.database import dialects
 from storage.database.engine import open_engine, writing
 with writing(open_engine(sys.argv[1])) as connection:
     print("inside", flush=True)

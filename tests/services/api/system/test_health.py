@@ -28,7 +28,7 @@ def test_check_that_hangs_answers_with_the_last_result_and_then_fails(
         return "ok"
 
     async def ask() -> None:
-        check = Check(hang)
+        check = Check("hanging", hang)
         while (await check.result()) != "ok":  # a busy machine may take longer than a first answer waits
             pass
         answers.clear()
@@ -54,7 +54,7 @@ def test_checks_run_once_in_an_interval_however_often_they_are_asked_for() -> No
         return "ok"
 
     async def ask() -> None:
-        one = Check(check)
+        one = Check("counting", check)
         end = time.monotonic() + 2.5 * health.INTERVAL
         while time.monotonic() < end:
             await asyncio.gather(*(one.result() for _ in range(20)))
@@ -93,6 +93,8 @@ def test_checks_write_nothing_and_name_what_fails(
     found = asyncio.run(_results(engine, objects))
     assert found["database"] == found["cluster"] == "DatabaseError; the log of the service has more"
     assert "file is not a database" in caplog.text
+    assert "not ready: database: DatabaseError" in caplog.text
+    assert "not ready: cluster: DatabaseError" in caplog.text
 
 
 def test_no_more_than_the_code_of_what_a_bucket_answers_is_told(
