@@ -16,7 +16,7 @@ from services.runtime.data_folder import lock_data, make_data
 from services.runtime.logs import configure_logging
 from services.runtime.malloc import limit_arenas
 from services.runtime.signals import exit_on_signal
-from services.settings import CoordinatorSettings, Settings
+from services.settings import CoordinatorSettings, Settings, warn_of_unknown
 from services.webhooks.sender import Sender
 from storage.database.disk_reserve import keep_reserve
 from storage.database.engine import open_engine
@@ -70,8 +70,8 @@ def serve(settings: Settings) -> None:
             _run_jobs(stack, settings, engine, objects)
         socket.listen()  # from here on connections are accepted, and answered soon
         host, port = socket.getsockname()[:2]
-        where = settings.data if settings.alone else "jobs"
-        print(f"envmatte serves {where} at {url_of(host, port)}", flush=True)
+        data = f" {settings.data}" if settings.alone else ""
+        print(f"envmatte serves{data} at {url_of(host, port)}", flush=True)
         Server(config).run(sockets=[socket])
 
 
@@ -99,6 +99,7 @@ def _opened(settings: CoordinatorSettings, role: str) -> Iterator[tuple[ExitStac
     exit_on_signal()
     limit_arenas()
     configure_logging(settings.log, settings.log_level, role)
+    warn_of_unknown()
     configure_dask()
     tracing.start(role)
     make_data(settings.data)

@@ -4,6 +4,7 @@ Every setting is an environment variable ``ENVMATTE_…`` and a line in the file
 wins. What only some settings need is imported where they are checked, so that `envmatte serve --help` is quick.
 """
 
+import logging
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -12,13 +13,15 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from services.runtime.addresses import is_loopback
-from services.runtime.environment import DATA, PREFIX, database_url, read_environment
+from services.runtime.environment import DATA, PREFIX, database_url, read_environment, unknown_variables
 from services.runtime.webhook_signature import signing_key
 from storage.errors import InvalidInput
 from workflows.untrusted.limits import MAX_FRAMES, Limits
 
 if TYPE_CHECKING:
     from distributed.security import Security
+
+logger = logging.getLogger(__name__)
 
 
 def _setting(default: Any, description: str, *, unset: str = "", **constraints: Any) -> Any:
@@ -343,6 +346,21 @@ GROUPS = {
     "Logging": ("log", "log_level"),
 }
 """The settings in the order in which people read about them."""
+
+
+OF_CLIENTS = ("url", "key")
+"""What the environment may hold for the commands that talk to a service."""
+OF_COMPOSE = ("image", "listen")
+"""What the file .env may hold for docker/compose.yaml, as it says at its top."""
+
+
+def warn_of_unknown() -> None:
+    """Log which variables and lines of .env set nothing: a misspelt limit would be none."""
+    unknown = unknown_variables({*Settings.model_fields, *OF_CLIENTS, *OF_COMPOSE})
+    if unknown:
+        logger.warning(
+            "no settings of envmatte, and ignored: %s; `envmatte serve --help` lists all", ", ".join(unknown)
+        )
 
 
 class Setting(NamedTuple):

@@ -10,7 +10,7 @@ from services.runtime.addresses import cannot_listen, is_loopback
 from services.runtime.certificates import security_of
 from services.runtime.logs import configure_logging
 from services.runtime.signals import run_until_signal
-from services.settings import SchedulerSettings
+from services.settings import SchedulerSettings, warn_of_unknown
 from storage.errors import InvalidInput
 
 
@@ -36,6 +36,7 @@ def schedule(settings: SchedulerSettings, host: str, port: int) -> None:
         At SIGINT.
     """
     configure_logging(settings.log, settings.log_level, "scheduler")
+    warn_of_unknown()
     configure_dask()
     certs = settings.certificates
     if certs is None and not is_loopback(host):

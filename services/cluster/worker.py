@@ -19,7 +19,7 @@ from services.cluster.nanny import Nanny
 from services.runtime.addresses import is_loopback
 from services.runtime.logs import configure_logging
 from services.runtime.signals import run_until_signal
-from services.settings import ClusterSettings
+from services.settings import ClusterSettings, warn_of_unknown
 from storage.errors import InvalidInput
 from storage.outage import Outage
 
@@ -46,6 +46,7 @@ def work(settings: ClusterSettings, host: str | None) -> None:
         At SIGINT.
     """
     configure_logging(settings.log, settings.log_level, "nanny")
+    warn_of_unknown()
     configure_dask()
     if settings.cluster is None:
         raise InvalidInput(

@@ -22,6 +22,15 @@ def read_environment(names: Container[str]) -> dict[str, str]:
     names : container of str
         Names of settings, as ``worker_memory`` for ``ENVMATTE_WORKER_MEMORY``.
     """
+    return {name: value for name, value in _all().items() if name in names}
+
+
+def unknown_variables(names: Container[str]) -> list[str]:
+    """The variables ``ENVMATTE_…`` and lines of the file that set none of these, such as misspelt ones."""
+    return sorted(PREFIX + name.upper() for name in _all() if name not in names)
+
+
+def _all() -> dict[str, str]:
     lines: dict[str, str | None] = {}
     if FILE.is_file():
         from dotenv import dotenv_values
@@ -30,7 +39,7 @@ def read_environment(names: Container[str]) -> dict[str, str]:
     found = {}
     for variable, value in [*lines.items(), *os.environ.items()]:
         prefix, name = variable[: len(PREFIX)].upper(), variable[len(PREFIX) :].lower()
-        if value and prefix == PREFIX and name in names:
+        if value and prefix == PREFIX:
             found[name] = value
     return found
 

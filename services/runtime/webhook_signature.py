@@ -36,7 +36,7 @@ def signing_key(secret: str) -> bytes:
                 encoded + b"=" * (-len(encoded) % 4), validate=True
             )  # padding may be left out
         except binascii.Error as error:
-            raise ValueError(f"what follows {PREFIX} must be Base64") from error
+            raise ValueError(f"must be Base64 after {PREFIX}") from error
     if len(key) < LEAST_BYTES:
         raise ValueError(f"must stand for a key of {LEAST_BYTES} bytes or more")
     return key

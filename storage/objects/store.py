@@ -23,6 +23,7 @@ from zarr.storage import MemoryStore, StorePath
 from zarr.storage import ObjectStore as ZarrStore
 
 from storage import disks
+from storage.errors import StoreUnavailable
 from storage.objects import byte_objects, checksums, zarr_store
 from storage.objects.byte_objects import PART, Writer
 from storage.objects.checksums import SUFFIX
@@ -53,6 +54,11 @@ class Objects:
     key : str, optional
         API key that goes with requests to ``http://``.
 
+    Raises
+    ------
+    StoreUnavailable
+        If the folder cannot be created.
+
     Notes
     -----
     All methods that access a bucket raise `StoreUnavailable` if it cannot be reached.
@@ -66,7 +72,12 @@ class Objects:
         if url.startswith("file:"):
             self._folder = Path(url2pathname(urlsplit(url).path))
             # Deleting the last object of a folder, also by zarr, deletes the folder.
-            self._store = LocalStore.from_url(url, mkdir=True, automatic_cleanup=True)
+            try:
+                self._store = LocalStore.from_url(url, mkdir=True, automatic_cleanup=True)
+            except OSError as error:
+                raise StoreUnavailable(
+                    f"cannot open the store {url}: {error}; name a folder that can be made (--store, ENVMATTE_STORE)"
+                ) from error
         else:
             headers: ClientConfig = {"default_headers": {"Authorization": f"Bearer {key}"}} if key else {}
             self._store = from_url(url, client_options=REQUESTS | headers, retry_config=RETRIES)

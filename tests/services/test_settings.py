@@ -7,7 +7,14 @@ import pytest
 from pydantic import ValidationError
 
 from services.runtime import certificates as certificate_files
-from services.settings import GROUPS, ClusterSettings, SchedulerSettings, Settings, describe_settings
+from services.settings import (
+    GROUPS,
+    ClusterSettings,
+    SchedulerSettings,
+    Settings,
+    describe_settings,
+    warn_of_unknown,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -168,3 +175,17 @@ def test_stores_and_databases_of_other_kinds_are_refused(wrong: dict[str, str]) 
         Settings(**wrong)
     assert re.search("give it as|must be postgresql:|sqlite:////FILE", caught.value.errors()[0]["msg"])
     assert "secret" not in caught.value.errors()[0]["msg"]
+
+
+def test_misspelt_variables_are_named_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("ENVMATTE_KEY", "ENVMATTE_URL", "ENVMATTE_LISTEN", "ENVMATTE_PORT"):
+        monkeypatch.setenv(name, "1")
+    warn_of_unknown()
+    assert caplog.messages == []
+    monkeypatch.setenv("ENVMATTE_STORE_BYTE", "1")
+    monkeypatch.setenv("ENVMATTE_OWNERS_JOBS", "1")
+    warn_of_unknown()
+    (line,) = caplog.messages
+    assert "ignored: ENVMATTE_OWNERS_JOBS, ENVMATTE_STORE_BYTE;" in line

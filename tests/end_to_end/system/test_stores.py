@@ -54,3 +54,12 @@ def test_a_store_that_refuses_is_named_to_all_who_ask(
         assert refused.value.retry_after == 2
         until(lambda: "housekeeping is tried again later: the store refuses" in service.log())
         assert "Traceback" not in service.log()
+
+
+def test_an_api_alone_says_where_it_is_and_which_variables_it_does_not_know(tmp_path: Path) -> None:
+    command = ("serve", "--port", "0", "--data", str(tmp_path), "--store", (tmp_path / "other").as_uri())
+    settings = {"ENVMATTE_COORDINATE": "false", "ENVMATTE_STROE_BYTES": "1"}
+    with started(tmp_path / "log", *command, **settings) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("envmatte serves at http://127.0.0.1:")
+        assert (tmp_path / "log").read_text().count("ignored: ENVMATTE_STROE_BYTES;") == 1

@@ -1,10 +1,11 @@
 """The environment: which variables and lines of .env count, and where the database is by them."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-from services.runtime.environment import database_url, read_environment
+from services.runtime.environment import database_url, read_environment, unknown_variables
 
 NAMES = {"port", "worker_memory"}
 
@@ -32,6 +33,14 @@ def test_an_empty_value_counts_as_not_set(monkeypatch: pytest.MonkeyPatch) -> No
 def test_case_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("Envmatte_Port", "1")
     assert read_environment(NAMES) == {"port": "1"}
+
+
+def test_what_is_no_setting_is_found_in_variables_and_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in os.environ if name.startswith("ENVMATTE_")]:
+        monkeypatch.delenv(name)
+    Path(".env").write_text("ENVMATTE_PORT=1\nENVMATTE_WORKER_MEMROY=2\nPORT=4\nENVMATTE_EMPTY=\n")
+    monkeypatch.setenv("ENVMATTE_STROE", "s3://bucket")
+    assert unknown_variables(NAMES) == ["ENVMATTE_STROE", "ENVMATTE_WORKER_MEMROY"]
 
 
 def test_the_database_is_in_the_data_folder_unless_named(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ def test_padding_of_base64_may_be_left_out() -> None:
 @pytest.mark.parametrize(
     ("secret", "reason"),
     [
-        ("whsec_not Base64 at all!", "must be Base64"),
+        ("whsec_not Base64 at all!", "must be Base64 after whsec_"),
         ("whsec_c2hvcnQga2V5", "16 bytes"),
         ("too short", "16"),
     ],

@@ -17,7 +17,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.storage import MemoryStore
 
-from storage.errors import Corrupt
+from storage.errors import Corrupt, StoreUnavailable
 from storage.objects.byte_objects import PART
 from storage.objects.checksums import CODECS
 from storage.objects.event_loop import gather
@@ -39,6 +39,11 @@ def test_streamed_object_is_read_back(objects: Objects, folder: Path) -> None:
         assert file.seek(-4, io.SEEK_END) == len(data) - 4
         assert file.read(100) == data[-4:]
         assert file.read(1) == b""
+
+
+def test_a_folder_that_cannot_be_made_is_named() -> None:
+    with pytest.raises(StoreUnavailable, match=r"cannot open the store file:///proc/x: .*ENVMATTE_STORE"):
+        Objects("file:///proc/x")
 
 
 def test_zipfile_reads_object(objects: Objects) -> None:
