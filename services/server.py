@@ -18,6 +18,7 @@ from services.runtime.malloc import limit_arenas
 from services.runtime.signals import exit_on_signal
 from services.settings import CoordinatorSettings, Settings, warn_of_unknown
 from services.webhooks.sender import Sender
+from storage import installation
 from storage.database.disk_reserve import keep_reserve
 from storage.database.engine import open_engine
 from storage.objects.store import Objects
@@ -36,6 +37,8 @@ def serve(settings: Settings) -> None:
     ------
     Conflict
         If another service uses the data folder, or it can't listen at its address.
+    WrongStore
+        If the store is not the one that the database belongs to.
     """
     # A coordinator alone needs none of these, and starts without them.
     import uvicorn
@@ -51,10 +54,10 @@ def serve(settings: Settings) -> None:
     with (
         # The port is bound before anything is made or started, so that one in use is reported at once.
         bind(settings.host, settings.port) as socket,
-        _opened(settings, "service") as (stack, engine, objects),
+        _opened(settings, "service") as (stack, engine, objects, id),
     ):
         require_keys_unless_loopback(settings, engine)
-        app = build_app(settings, engine, objects)
+        app = build_app(settings, engine, objects, id)
         stack.callback(app.state.context.decoders.close)
         config = uvicorn.Config(
             SecurityHeaders(app),
@@ -67,7 +70,7 @@ def serve(settings: Settings) -> None:
             timeout_graceful_shutdown=GRACE,
         )
         if settings.coordinate:
-            _run_jobs(stack, settings, engine, objects)
+            _run_jobs(stack, settings, engine, objects, id)
         socket.listen()  # from here on connections are accepted, and answered soon
         host, port = socket.getsockname()[:2]
         data = f" {settings.data}" if settings.alone else ""
@@ -77,24 +80,29 @@ def serve(settings: Settings) -> None:
 
 def coordinate(settings: CoordinatorSettings) -> None:
     """Run jobs while no other coordinator does, until interrupted."""
-    with _opened(settings, "coordinator") as (stack, engine, objects):
-        _run_jobs(stack, settings, engine, objects)
+    with _opened(settings, "coordinator") as (stack, engine, objects, id):
+        _run_jobs(stack, settings, engine, objects, id)
         print("envmatte coordinates", flush=True)
         while True:
             time.sleep(1)  # unlike signal.pause(), it ends although a signal comes just before it
 
 
-def _run_jobs(stack: ExitStack, settings: CoordinatorSettings, engine: Engine, objects: Objects) -> None:
+def _run_jobs(
+    stack: ExitStack, settings: CoordinatorSettings, engine: Engine, objects: Objects, id: str
+) -> None:
     """Run jobs, and call webhooks about them, until the stack is closed."""
-    dispatcher = stack.enter_context(dispatcher_of(settings))
+    dispatcher = stack.enter_context(dispatcher_of(settings, id))
     coordinator = stack.enter_context(Coordinator(settings, engine, objects, dispatcher))
     if settings.webhook_secret:
         stack.enter_context(Sender(settings, engine, lambda: coordinator.token))
 
 
 @contextmanager
-def _opened(settings: CoordinatorSettings, role: str) -> Iterator[tuple[ExitStack, Engine, Objects]]:
-    """Configure this process, and open the database and the store; the stack is closed before they are."""
+def _opened(settings: CoordinatorSettings, role: str) -> Iterator[tuple[ExitStack, Engine, Objects, str]]:
+    """Configure this process, and open the database and the store, with the installation's id.
+
+    The stack is closed before they are.
+    """
     # uvicorn raises the signal that stopped it again when it ends: everything open here must be closed first.
     exit_on_signal()
     limit_arenas()
@@ -109,4 +117,5 @@ def _opened(settings: CoordinatorSettings, role: str) -> Iterator[tuple[ExitStac
         engine = open_engine(settings.database_url)
         stack.callback(engine.dispose)
         keep_reserve(engine)
-        yield stack, engine, Objects(settings.store_url)
+        objects = Objects(settings.store_url)
+        yield stack, engine, objects, installation.recognise(engine, objects)

@@ -16,6 +16,7 @@
     ├── TooMany                 too many uploads, jobs or requests at the same time
     ├── Unavailable             something that the service needs cannot be reached now
     │   └── StoreUnavailable    the object store
+    │       └── WrongStore      what is there is not the store of this installation
     ├── Corrupt                 stored data is missing or damaged
     └── GaveUp                  work that failed in all of its attempts
 
@@ -108,6 +109,10 @@ class Unavailable(EnvmatteError):
 
 class StoreUnavailable(Unavailable):
     """The object store cannot be reached now."""
+
+
+class WrongStore(StoreUnavailable):
+    """What a machine sees in place of the installation's store is another one, such as a folder that is not mounted."""
 
 
 class Corrupt(EnvmatteError):

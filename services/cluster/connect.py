@@ -79,15 +79,21 @@ def _loop() -> IOLoop:
 
 
 @contextmanager
-def dispatcher_of(settings: CoordinatorSettings) -> Iterator[Dispatcher]:
-    """A dispatcher for the cluster that the settings name, reachable yet or not, or for an embedded one."""
+def dispatcher_of(settings: CoordinatorSettings, installation: str | None = None) -> Iterator[Dispatcher]:
+    """A dispatcher for the cluster that the settings name, reachable yet or not, or for an embedded one.
+
+    Parameters
+    ----------
+    installation : str, optional
+        What workers recognise the store by.
+    """
     if settings.cluster:
         remote = partial(connect, settings.cluster, settings.security())
-        with Dispatcher(remote, settings.store_url) as dispatcher:
+        with Dispatcher(remote, settings.store_url, installation=installation) as dispatcher:
             yield dispatcher
     else:
         with embedded(settings) as cluster:
             local = partial(Client, cluster, set_as_default=False)
             scale = Scale(cluster.scale, settings.workers)
-            with Dispatcher(local, settings.store_url, scale) as dispatcher:
+            with Dispatcher(local, settings.store_url, scale, installation) as dispatcher:
                 yield dispatcher

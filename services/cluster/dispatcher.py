@@ -99,14 +99,21 @@ class Dispatcher:
         URL of the object store that workers read and write.
     scale : callable, optional
         Is called with the number of tiles to do, if workers of the cluster can be started and stopped.
+    installation : str, optional
+        What workers recognise the store by, see `storage.objects.marker`.
     """
 
     def __init__(
-        self, connect: Callable[[], Client], store: str, scale: Callable[[int], None] | None = None
+        self,
+        connect: Callable[[], Client],
+        store: str,
+        scale: Callable[[int], None] | None = None,
+        installation: str | None = None,
     ) -> None:
         self._connect = connect
         self._store = store
         self._scale = scale
+        self._installation = installation
         self._client: Client | None = None
         self._flights: dict[str, Flight] = {}
         """By the keys of their dask tasks."""
@@ -172,6 +179,7 @@ class Dispatcher:
         what = {
             "steps": steps,
             "store": self._store,
+            "installation": self._installation,
             "task": task,
             "trace": trace,
             "topic": _topic_of(client),

@@ -6,6 +6,8 @@ to fetch a result, the scheduler would open a connection to its worker.
 
 import logging
 import re
+import socket
+import time
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -15,7 +17,8 @@ from distributed import get_worker
 
 from services.runtime import tracing
 from services.runtime.logs import about
-from storage.errors import EnvmatteError, InvalidInput, NoRoom, StoreUnavailable
+from storage.errors import EnvmatteError, InvalidInput, NoRoom, StoreUnavailable, WrongStore
+from storage.objects import marker
 from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from workflows import jobs
@@ -23,6 +26,8 @@ from workflows.jobs import Steps, Task
 
 logger = logging.getLogger(__name__)
 
+BLIND = 5.0
+"""Seconds that a worker takes for a step if it does not see the installation's store."""
 NAMES = {PREPARE: "prepare", FINISH: "finish"}
 KEY = re.compile(r"[a-z]+-([0-9a-f]+)-(-?\d+)-[0-9a-f]+")
 
@@ -38,7 +43,15 @@ def read_key(key: str) -> tuple[str, int] | None:
     return (found[1], int(found[2])) if found else None
 
 
-def run(tiles: Sequence[int], steps: Steps, store: str, task: Task, trace: str | None, topic: str) -> None:
+def run(
+    tiles: Sequence[int],
+    steps: Steps,
+    store: str,
+    task: Task,
+    trace: str | None,
+    topic: str,
+    installation: str | None = None,
+) -> None:
     """Run steps of a job in a worker, one after another.
 
     Parameters
@@ -50,25 +63,33 @@ def run(tiles: Sequence[int], steps: Steps, store: str, task: Task, trace: str |
     topic : str
         Of an event for each step: the ``key`` of the dask task, the ``tile``, and what `workflows.jobs.run` returns,
         ``seconds`` and ``result``.
+    installation : str, optional
+        What the store is recognised by, see `storage.objects.marker`.
     """
     worker = get_worker()
     for tile in tiles:
-        seconds, result = _run(tile, steps, store, task, trace)
+        seconds, result = _run(tile, steps, store, task, trace, installation)
         event = {"key": worker.get_current_task(), "tile": tile, "seconds": seconds, "result": result}
         worker.log_event(topic, event)
 
 
-def _run(tile: int, steps: Steps, store: str, task: Task, trace: str | None) -> tuple[float, Any]:
+def _run(
+    tile: int, steps: Steps, store: str, task: Task, trace: str | None, installation: str | None = None
+) -> tuple[float, Any]:
     attributes = {"tile": tile} if tile >= 0 else {}
     name = f"{steps.kind} {NAMES.get(tile, 'tile')}"
     with about(task.job, tile), tracing.span(name, trace, job=task.job, kind=steps.kind, **attributes):
         try:
-            seconds, result = jobs.run(steps, _objects(store), task, tile)
+            seconds, result = jobs.run(steps, _objects(store, installation), task, tile)
         except EnvmatteError as error:
             if not isinstance(error, InvalidInput):  # the caller's fault is for the job to tell
                 # With a full disk, or without a store, every tile fails, and the text says why.
                 expected = isinstance(error, NoRoom | StoreUnavailable)
                 logger.warning("failed: %s", error.detail, exc_info=not expected)
+            if isinstance(
+                error, WrongStore
+            ):  # others would have less to do than this worker, which fails at once
+                time.sleep(BLIND)
             # Sent back without its cause: an error of a library may not be picklable, and would take this one with it.
             error.__cause__ = error.__context__ = None
             raise
@@ -80,6 +101,9 @@ def _run(tile: int, steps: Steps, store: str, task: Task, trace: str | None) -> 
 
 
 @lru_cache(maxsize=1)
-def _objects(url: str) -> Objects:
-    """The object store of this worker process."""
-    return Objects(url)
+def _objects(url: str, installation: str | None) -> Objects:
+    """The object store of this worker process, once it is found to be the installation's."""
+    objects = Objects(url)
+    if installation is not None:
+        marker.require(objects, installation, f"the worker on {socket.gethostname()}")
+    return objects

@@ -16,7 +16,7 @@ from services.runtime import tracing
 from services.runtime.logs import about
 from services.runtime.problems import problem_of
 from storage import steps as job_steps
-from storage.errors import EnvmatteError, GaveUp, StoreUnavailable, Unavailable
+from storage.errors import EnvmatteError, GaveUp, StoreUnavailable, Unavailable, WrongStore
 from storage.records import jobs
 from storage.records import tiles as tile_records
 from storage.steps import FINISH, PREPARE
@@ -48,6 +48,8 @@ class Next:
         Whether the job has ended.
     without_store : bool
         Whether its tiles can't reach the store.
+    held : bool
+        Whether no tile is to be submitted for a while, because no worker reaches it.
     """
 
     stage: str
@@ -55,6 +57,7 @@ class Next:
     task: Task
     ended: bool = False
     without_store: bool = False
+    held: bool = False
 
 
 @dataclass
@@ -85,6 +88,8 @@ class JobRun:
         Whether a tile could not reach the store, and none has been done since.
     hold_until : float
         When the next tiles may be submitted.
+    blind : bool
+        Whether some worker did not see the store, which the job's log tells once.
     """
 
     job: str
@@ -103,6 +108,7 @@ class JobRun:
     counted: int = 0
     without_store: bool = False
     hold_until: float = 0.0
+    blind: bool = False
 
     @classmethod
     def of(cls, row: Row[Any], tiles: Sequence[int], limits: Limits) -> "JobRun":
@@ -190,13 +196,19 @@ class JobRun:
         if tiles and self.paced != threads:
             # Not from the first tiles: their workers load what later ones find loaded.
             self.paced = threads if tile_records.start_pace(connection, self.job, after=threads) else 0
-        without_store = self.without_store and not results
+        without_store, held = self.without_store and not results, False
         for outcome in self.outcomes:
             if outcome.done is not None:
                 continue
             if isinstance(outcome.error, StoreUnavailable):  # no fault of the tile, so it is no attempt
-                if not without_store:
+                blind = isinstance(outcome.error, WrongStore)  # other workers may see it
+                if blind:
+                    with about(self.job, outcome.tile):
+                        logger.warning("%s", outcome.error.detail)
+                if not (without_store or (blind and self.blind)):
                     jobs.log(connection, self.job, f"waiting for the store: {outcome.error.detail}")
+                self.blind |= blind
+                held |= not blind
                 without_store = True
                 again.append(outcome.tile)
                 continue
@@ -214,14 +226,17 @@ class JobRun:
             return self._finished(connection, results[FINISH][1])
         if self.stage == self.kind.steps.stage and not (again or self.to_do or under_way):
             return self._enter(connection, "finishing", [FINISH])
-        return Next(self.stage, again, self.task, without_store=without_store)
+        return Next(self.stage, again, self.task, without_store=without_store, held=held)
 
     def advance(self, following: Next) -> None:
         """Continue as `write` returned; call it after that is committed."""
         if following.stage != self.stage or following.without_store:
             self.paced = 0
         self.without_store = following.without_store
-        self.hold_until = time.monotonic() + HOLD if self.without_store else 0.0
+        if following.held:
+            self.hold_until = time.monotonic() + HOLD
+        elif not self.without_store:
+            self.hold_until = 0.0
         self.stage, self.task = following.stage, following.task
         self.to_do.extend(following.to_do)
         self.outcomes.clear()

@@ -5,7 +5,7 @@ Both are answered without alembic, so that a process that opens an up-to-date da
 
 from sqlalchemy import Connection, inspect, text
 
-NEWEST = "0014"
+NEWEST = "0015"
 """The newest file in `storage.database.migrations.versions`: the revision of `storage.database.tables`."""
 
 

@@ -170,6 +170,13 @@ coordinator = Table(
 )
 """One row: the lease of the coordinator, with times by the database's clock. See `storage.records.leases`."""
 
+installation = Table(
+    "installation",
+    metadata,
+    Column("id", String(32), primary_key=True),
+)
+"""One row: what the store of this database is recognised by. See `storage.installation`."""
+
 totals = Table(
     "totals",
     metadata,

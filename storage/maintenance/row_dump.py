@@ -1,8 +1,8 @@
 """The rows of a database of any revision as lines of JSON, for backups.
 
-A line is a list of two: the name of a table, and a row as an object. The coordinator's lease is left out, because it
-means nothing to the restored installation, and so are the requests under way, and webhook deliveries, because the
-original service makes them.
+A line is a list of two: the name of a table, and a row as an object. The coordinator's lease and the installation's id
+are left out, because they mean nothing to the restored installation. So are the requests under way, and webhook
+deliveries, because the original service makes them.
 """
 
 import json
@@ -34,7 +34,7 @@ from storage.database.revision import revision
 from storage.database.tables import metadata
 from storage.errors import Conflict, InvalidInput
 
-SKIPPED = ("coordinator", "deliveries", "bodies")
+SKIPPED = ("coordinator", "installation", "deliveries", "bodies")
 OF_ROWS = {"links": "matte", "tiles": "job", "log": "job"}
 """Tables whose rows belong to those of another table, and the column that says to which."""
 BATCH = 500
@@ -133,11 +133,11 @@ def to_line(name: str, row: Mapping[str, Any]) -> bytes:
 
 
 def counts(connection: Connection, tables: Mapping[str, Table]) -> dict[str, int]:
-    """The number of rows of each table that has any; without the coordinator's lease, which every service has."""
+    """The number of rows of each table that has any; without those that every service has once it was started."""
     found = {
         name: connection.scalar(select(func.count()).select_from(table)) or 0
         for name, table in tables.items()
-        if name != "coordinator"
+        if name not in ("coordinator", "installation")
     }
     return {name: count for name, count in found.items() if count}
 

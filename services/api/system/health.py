@@ -16,6 +16,7 @@ from storage.database.disk_reserve import file_of
 from storage.database.engine import reading
 from storage.disks import require_reserve
 from storage.errors import EnvmatteError
+from storage.objects import marker
 from storage.objects.store import Objects
 from storage.records import leases
 from storage.records.leases import Heartbeat
@@ -83,7 +84,7 @@ class Check:
             return found
 
 
-def checks(engine: Engine, objects: Objects) -> dict[str, Check]:
+def checks(engine: Engine, objects: Objects, installation: str | None = None) -> dict[str, Check]:
     """The checks of a service, by their fields in `Readiness`. None of them writes.
 
     Coordinators write their heartbeat to the database all the time, so a database that takes no writes is seen by it.
@@ -101,6 +102,8 @@ def checks(engine: Engine, objects: Objects) -> dict[str, Check]:
 
     def store() -> str:
         objects.check_reachable()
+        if installation is not None:
+            marker.require(objects, installation)
         objects.require_reserve()
         return "ok"
 

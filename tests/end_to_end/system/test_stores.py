@@ -1,5 +1,6 @@
 """A cluster on a bucket makes the same bytes as a single machine on a folder; a bucket that refuses is named."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,8 @@ def test_a_store_that_refuses_is_named_to_all_who_ask(
     capture_archive: Path, s3: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_transport, "PATIENCE", 1.0)
+    with serving(tmp_path / "data", "--store", s3, ENVMATTE_COORDINATE="false"):
+        pass  # later starts don't wait for a store that is away
     where = ("--store", s3.replace("envmatte", "another"), "--workers", "1")
     with serving(tmp_path / "data", *where) as service:
         ready = service.http.get("/readyz")
@@ -63,3 +66,39 @@ def test_an_api_alone_says_where_it_is_and_which_variables_it_does_not_know(tmp_
         assert process.stdout is not None
         assert process.stdout.readline().startswith("envmatte serves at http://127.0.0.1:")
         assert (tmp_path / "log").read_text().count("ignored: ENVMATTE_STROE_BYTES;") == 1
+
+
+BLINDED = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs none "$0" && exec "$@"')
+"""Runs a command that sees an empty folder in place of another, as on a machine where a share is not mounted."""
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can mount")
+@pytest.mark.slow
+def test_a_machine_that_does_not_see_the_store_fails_no_job(capture_archive: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    store.mkdir()
+    with started(tmp_path / "scheduler.log", "scheduler", "--port", "0") as scheduler:
+        named = ("--cluster", address(scheduler))
+        where = (*named, "--store", store.as_uri())
+        blind, sees = tmp_path / "blind.log", tmp_path / "sees.log"
+        of_worker = ("worker", *named, "--workers", "1")
+        with serving(tmp_path / "data", *where) as service, started(sees, *of_worker):
+            with started(blind, *of_worker, within=(*BLINDED, str(store))):
+                until(lambda: len(service.http.get("/v1/cluster").json()["workers"]) == 2)
+                uploaded = service.client.upload(capture_archive)
+                service.client.wait(uploaded["job"])
+                job = service.client.recover(uploaded["id"])
+                assert service.client.wait(job["id"])["state"] == "succeeded"
+            complaint = "does not see the store of this installation"
+            assert complaint in blind.read_text()
+            assert complaint in service.log()
+            assert complaint not in sees.read_text()
+            assert service.http.get("/readyz").json()["store"] == "ok"
+            store.rename(tmp_path / "unmounted")
+            store.mkdir()
+            until(lambda: complaint in service.http.get("/readyz").json()["store"])
+        with started(
+            tmp_path / "again.log", "serve", "--port", "0", "--data", str(tmp_path / "data"), *where
+        ) as again:
+            assert again.wait(60) == 1
+        assert complaint in (tmp_path / "again.log").read_text()

@@ -1,13 +1,16 @@
 """What a worker logs about steps that fail."""
 
 import logging
+import socket
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from services.cluster import task as module
-from storage.errors import Corrupt, EnvmatteError, InvalidInput, NoRoom, StoreUnavailable
+from storage.errors import Corrupt, EnvmatteError, InvalidInput, NoRoom, StoreUnavailable, WrongStore
+from storage.objects import marker
 from storage.objects.store import Objects
 from workflows.jobs import Task
 from workflows.mattes.steps import STEPS
@@ -33,3 +36,24 @@ def test_only_what_its_text_does_not_explain_has_a_traceback(
     raised = [record.exc_info[0] if record.exc_info else None for record in caplog.records]
     assert raised == logged
     assert all("for a reason" in record.getMessage() for record in caplog.records)
+
+
+def test_a_worker_looks_for_the_store_until_it_sees_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "BLIND", 0.3)
+    worked: list[int] = []
+
+    def work(objects: Objects, task: Task, tile: int) -> int:
+        worked.append(tile)
+        return 1
+
+    task = Task("a", "none", "none", {}, Limits(1 << 30, 1 << 26))
+    given = replace(STEPS, work=work), tmp_path.as_uri(), task, None, "this one"
+    start = time.monotonic()
+    with pytest.raises(WrongStore, match=f"the worker on {socket.gethostname()} does not see"):
+        module._run(0, *given)
+    assert time.monotonic() - start > module.BLIND  # others take what is to do meanwhile
+    marker.write(Objects(tmp_path.as_uri()), "this one")
+    module._run(1, *given)
+    assert worked == [1]

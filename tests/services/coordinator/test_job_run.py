@@ -13,7 +13,7 @@ from services.coordinator import job_run
 from services.coordinator.job_run import LOSSES, JobRun
 from storage.database.engine import open_engine, writing
 from storage.database.tables import tiles, totals
-from storage.errors import Corrupt, StoreUnavailable, Unavailable
+from storage.errors import Corrupt, StoreUnavailable, Unavailable, WrongStore
 from storage.records import captures, jobs, mattes
 from storage.records import tiles as tile_records
 from storage.steps import FINISH, PREPARE
@@ -162,6 +162,23 @@ def test_outage_of_the_store_is_waited_for(
     assert (run.held, run.without_store) == (False, False)
     assert advance(connection, run, away)
     assert lines(connection, job).count(lines(connection, job)[-1]) == 2  # it is another outage
+
+
+def test_a_worker_that_does_not_see_the_store_neither_holds_the_job_nor_fails_it(
+    connection: Connection, job: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = working(connection, job)
+    blind = Outcome(job, 1, error=WrongStore("the machine m does not see the store"))
+    for _ in range(20):
+        assert advance(connection, run, blind)
+        assert (run.held, run.without_store) == (False, True)
+        assert advance(connection, run, done(run, 0), under_way=1)
+        assert not run.without_store
+    assert lines(connection, job)[-2:] == [
+        "recovering",
+        "waiting for the store: the machine m does not see the store",
+    ]
+    assert caplog.text.count("the machine m does not see the store") == 20
 
 
 def test_only_transient_errors_are_retried(connection: Connection, job: str) -> None:

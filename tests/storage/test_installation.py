@@ -1,0 +1,54 @@
+"""By what an installation recognises its store."""
+
+import threading
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Engine
+
+from storage import installation
+from storage.database.engine import reading
+from storage.errors import WrongStore
+from storage.objects import marker
+from storage.objects.store import Objects
+
+
+def test_the_first_start_marks_the_store_and_later_ones_recognise_it(
+    engine: Engine, objects: Objects, tmp_path: Path
+) -> None:
+    id = installation.recognise(engine, objects)
+    assert marker.read(objects) == id
+    assert installation.recognise(engine, objects) == id
+    elsewhere = Objects((tmp_path / "elsewhere").as_uri())
+    with pytest.raises(WrongStore, match="does not see the store of this installation"):
+        installation.recognise(engine, elsewhere)
+    assert elsewhere.names("") == []
+    marker.write(elsewhere, "another")
+    with pytest.raises(WrongStore):
+        installation.recognise(engine, elsewhere)
+
+
+def test_a_marked_store_keeps_its_mark_with_a_new_database(engine: Engine, objects: Objects) -> None:
+    marker.write(objects, "before")
+    assert installation.recognise(engine, objects) == "before"
+    assert marker.read(objects) == "before"
+
+
+def test_services_that_start_at_once_agree(engine: Engine, objects: Objects) -> None:
+    found: list[str] = []
+    threads = [
+        threading.Thread(target=lambda: found.append(installation.recognise(engine, objects)))
+        for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    with reading(engine) as c:
+        assert found == [installation.find(c)] * 4
+    assert marker.read(objects) == found[0]
+
+
+def test_a_store_that_is_away_is_not_waited_for(engine: Engine, s3: str) -> None:
+    id = installation.recognise(engine, Objects(s3))
+    assert installation.recognise(engine, Objects(s3.replace("envmatte", "another"))) == id
