@@ -13,21 +13,24 @@ class Outage:
     Parameters
     ----------
     logger : logging.Logger
+    quiet : float
+        Seconds without trouble until it is over, where some succeed while others fail.
     """
 
-    def __init__(self, logger: logging.Logger) -> None:
-        self._logger = logger
+    def __init__(self, logger: logging.Logger, quiet: float = 0.0) -> None:
+        self._logger, self._quiet = logger, quiet
         self._said_at: float | None = None
+        self._last = 0.0
 
     def goes_on(self, message: str, *arguments: object) -> None:
         """It is away now; the message says what is, and why."""
-        now = time.monotonic()
+        self._last = now = time.monotonic()
         if self._said_at is None or now - self._said_at >= SAY:
             self._said_at = now  # first, for the other threads that find it away
             self._logger.warning(message, *arguments)
 
     def is_over(self, message: str, *arguments: object) -> None:
         """It answers, maybe as it always did."""
-        if self._said_at is not None:
+        if self._said_at is not None and time.monotonic() - self._last >= self._quiet:
             self._said_at = None
             self._logger.info(message, *arguments)

@@ -25,7 +25,7 @@ from sqlalchemy.sql.functions import FunctionElement
 from storage.errors import DISK_FULL, Conflict, EnvmatteError, InvalidInput, NoRoom, Unavailable
 from storage.outage import Outage
 
-outage = Outage(logging.getLogger(__name__))
+outage = Outage(logging.getLogger(__name__), quiet=5)
 """Of the database of this process, whose errors are logged here and nowhere else: what they say is not for callers."""
 
 WRITE_LOCK = int.from_bytes(b"envmatte")
