@@ -86,7 +86,7 @@ class Coordinator:
         self._discards: list[tuple[float, Row[Any]]] = []
         """Jobs whose files are to be removed: the earliest time, and the job's row."""
         self._troubles: Counter[str] = Counter()
-        self._full = Outage(logger)
+        self._full = Outage(logger, quiet=5)
         self._beat_at = self._deleted_at = self._swept_at = self._wrote_at = self._read_at = -1e9
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="coordinator")
@@ -252,7 +252,7 @@ class Coordinator:
         """Start a job if what it needs is there; raises if it never will be."""
         with reading(self._engine) as c:
             row = jobs.get(c, job)
-            if not JOB_KINDS[row.kind].is_due(c, row):
+            if row.state not in jobs.ACTIVE or not JOB_KINDS[row.kind].is_due(c, row):
                 return
         with self._writing() as c:
             run = JobRun.of(row, tiles.remaining(c, row.id), self._settings.limits)
