@@ -1,17 +1,13 @@
 """What commands write: examples in their help, results on standard output, files."""
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
-from services.runtime.whole_files import open_whole
-
-STANDARD_OUTPUT = 1
-"""Its file descriptor."""
+from services.runtime.whole_files import is_standard_output, open_whole
 
 
 def example(*lines: str, more: str = "") -> str:
@@ -26,7 +22,7 @@ def print_result(result: Mapping[str, Any], as_json: bool, *names: str) -> None:
 
 def print_output(output: Path, as_json: bool) -> None:
     """Print the name of a file that was written, unless that is standard output, which has the file itself."""
-    if not os.path.samestat(output.stat(), os.fstat(STANDARD_OUTPUT)):
+    if not is_standard_output(output):
         print_result({"output": str(output)}, as_json, "output")
 
 

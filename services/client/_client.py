@@ -1,6 +1,8 @@
 """The client's calls."""
 
+import os
 import secrets
+import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
 from services.client._errors import JobFailed, NotFound
 from services.client._paths import id_of, path_of
 from services.client._records import Capture, Job, Layers, Matte, Record
-from services.runtime.whole_files import open_whole
+from services.runtime.whole_files import is_standard_output, open_whole
 
 if TYPE_CHECKING:
     from services.client._arrays import Floats
@@ -342,7 +344,7 @@ class Client:
             Is called with the bytes received, and with all there are.
         """
         with open_whole(file) as out:
-            may_restart = out.seekable()
+            may_restart = stat.S_ISREG(os.fstat(out.fileno()).st_mode) and not is_standard_output(file)
 
             def get() -> None:
                 with self._http.streamed("GET", f"{path_of(Matte, matte)}/archive") as answer:

@@ -1,6 +1,7 @@
 """Files that commands write with -o."""
 
 import os
+import stat
 import subprocess
 import sys
 import threading
@@ -117,3 +118,34 @@ def test_standard_output_has_the_file_and_nothing_else(tmp_path: Path) -> None:
         done = subprocess.run([*command, "--url", url], capture_output=True, timeout=300, check=True)
     assert done.stdout == ARCHIVE[2]
     assert os.listdir(tmp_path) == ["stdout"]
+
+
+def test_standard_output_that_is_a_file_keeps_what_it_has(tmp_path: Path) -> None:
+    (tmp_path / "stdout").symlink_to("/dev/fd/1")
+    command = [sys.executable, "-m", "services", "export", "m", "-o", str(tmp_path / "stdout")]
+    with scripted_server(lambda n: ARCHIVE) as (url, _), (tmp_path / "all").open("wb") as file:
+        for text in (b"before ", b" after"):
+            file.write(text)
+            file.flush()
+            if text == b"before ":
+                subprocess.run([*command, "--url", url], stdout=file, timeout=300, check=True)
+    assert (tmp_path / "all").read_bytes() == b"before " + ARCHIVE[2] + b" after"
+
+
+def test_closed_standard_output_is_none_of_the_files(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    code = f"from services.runtime.whole_files import *; print(is_standard_output(Path({str(tmp_path / 'file')!r})))"
+    shell = 'exec 3>&1; "$0" -c "import sys; sys.stdout = open(3, \'w\'); $1" >&-'
+    done = subprocess.run(
+        ["sh", "-c", shell, sys.executable, code], capture_output=True, timeout=60, check=True
+    )
+    assert done.stdout == b"False\n"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root makes devices")
+def test_an_export_into_a_device_is_written_to_it(tmp_path: Path) -> None:
+    null = tmp_path / "null"
+    os.mknod(null, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+    with scripted_server(lambda n: ARCHIVE) as (url, _):
+        export(null, url)
+    assert null.is_char_device()
