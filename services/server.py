@@ -54,7 +54,7 @@ def serve(settings: Settings) -> None:
     with (
         # The port is bound before anything is made or started, so that one in use is reported at once.
         bind(settings.host, settings.port) as socket,
-        _opened(settings, "service") as (stack, engine, objects, id),
+        _opened(settings, "service", mark=settings.coordinate) as (stack, engine, objects, id),
     ):
         require_keys_unless_loopback(settings, engine)
         app = build_app(settings, engine, objects, id)
@@ -88,7 +88,7 @@ def coordinate(settings: CoordinatorSettings) -> None:
 
 
 def _run_jobs(
-    stack: ExitStack, settings: CoordinatorSettings, engine: Engine, objects: Objects, id: str
+    stack: ExitStack, settings: CoordinatorSettings, engine: Engine, objects: Objects, id: str | None
 ) -> None:
     """Run jobs, and call webhooks about them, until the stack is closed."""
     dispatcher = stack.enter_context(dispatcher_of(settings, id))
@@ -98,7 +98,9 @@ def _run_jobs(
 
 
 @contextmanager
-def _opened(settings: CoordinatorSettings, role: str) -> Iterator[tuple[ExitStack, Engine, Objects, str]]:
+def _opened(
+    settings: CoordinatorSettings, role: str, *, mark: bool = True
+) -> Iterator[tuple[ExitStack, Engine, Objects, str | None]]:
     """Configure this process, and open the database and the store, with the installation's id.
 
     The stack is closed before they are.
@@ -118,4 +120,4 @@ def _opened(settings: CoordinatorSettings, role: str) -> Iterator[tuple[ExitStac
         stack.callback(engine.dispose)
         keep_reserve(engine)
         objects = Objects(settings.store_url)
-        yield stack, engine, objects, installation.recognise(engine, objects)
+        yield stack, engine, objects, installation.recognise(engine, objects, mark=mark)

@@ -86,10 +86,8 @@ def _run(
                 # With a full disk, or without a store, every tile fails, and the text says why.
                 expected = isinstance(error, NoRoom | StoreUnavailable)
                 logger.warning("failed: %s", error.detail, exc_info=not expected)
-            if isinstance(
-                error, WrongStore
-            ):  # others would have less to do than this worker, which fails at once
-                time.sleep(BLIND)
+            if isinstance(error, WrongStore):
+                time.sleep(BLIND)  # otherwise it would fail all tiles before others come to them
             # Sent back without its cause: an error of a library may not be picklable, and would take this one with it.
             error.__cause__ = error.__context__ = None
             raise
@@ -103,7 +101,11 @@ def _run(
 @lru_cache(maxsize=1)
 def _objects(url: str, installation: str | None) -> Objects:
     """The object store of this worker process, once it is found to be the installation's."""
-    objects = Objects(url)
+    machine = f"the worker on {socket.gethostname()}"
+    try:
+        objects = Objects(url)
+    except StoreUnavailable as error:  # its folder can't be made: that of other workers may be there
+        raise WrongStore(f"{machine}: {error.detail}") from error
     if installation is not None:
-        marker.require(objects, installation, f"the worker on {socket.gethostname()}")
+        marker.require(objects, installation, machine)
     return objects

@@ -43,5 +43,5 @@ def require(objects: Objects, installation: str, machine: str = "this machine") 
     if read(objects) != installation:
         raise WrongStore(
             f"{machine} does not see the store of this installation: its folder may not be mounted there, or its "
-            "bucket is another one"
+            f"bucket is another one. If it is the right store, copy the object `{PATH}` of the former one into it"
         )

@@ -1,6 +1,7 @@
 """Time limits and retries for requests to the store, and translation of its errors."""
 
 import errno
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -52,7 +53,7 @@ def translate_errors() -> Iterator[None]:
     FileNotFoundError
         If the folder of an object is removed while it is written.
     StoreUnavailable
-        If a bucket, or a service, does not answer or refuses all requests.
+        If a bucket, or a service, does not answer or refuses all requests, or a folder does.
     """
     try:
         yield
@@ -60,6 +61,11 @@ def translate_errors() -> Iterator[None]:
         message = str(error).partition("\n")[0]
         if any(f"(os error {number})" in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
             raise NoRoom(DISK_FULL) from error
+        for number in (errno.EROFS, errno.EACCES, errno.EPERM):
+            if f"(os error {number})" in str(error):
+                raise StoreUnavailable(
+                    f"the store refuses: {os.strerror(number)}; check how its folder is mounted, and its rights"
+                ) from error
         if f"(os error {errno.ENOENT})" in str(error):
             raise FileNotFoundError(errno.ENOENT, message) from error
         refused = next(filter(None, (pattern.search(str(error)) for pattern in REFUSED)), None)

@@ -11,6 +11,7 @@ from storage.database.engine import reading
 from storage.errors import WrongStore
 from storage.objects import marker
 from storage.objects.store import Objects
+from tests.storage.installation import fill
 
 
 def test_the_first_start_marks_the_store_and_later_ones_recognise_it(
@@ -52,3 +53,23 @@ def test_services_that_start_at_once_agree(engine: Engine, objects: Objects) -> 
 def test_a_store_that_is_away_is_not_waited_for(engine: Engine, s3: str) -> None:
     id = installation.recognise(engine, Objects(s3))
     assert installation.recognise(engine, Objects(s3.replace("envmatte", "another"))) == id
+
+
+def test_an_empty_store_is_not_that_of_a_database_with_captures(
+    engine: Engine, objects: Objects, tmp_path: Path
+) -> None:
+    fill(engine, objects)
+    unmounted = Objects((tmp_path / "unmounted").as_uri())
+    with pytest.raises(WrongStore, match="the store is empty"):
+        installation.recognise(engine, unmounted)
+    assert unmounted.names("") == []
+    # An earlier version did not mark its store.
+    id = installation.recognise(engine, objects)
+    assert marker.read(objects) == id
+
+
+def test_an_api_alone_marks_no_store(engine: Engine, objects: Objects) -> None:
+    assert installation.recognise(engine, objects, mark=False) is None
+    assert objects.names("") == []
+    id = installation.recognise(engine, objects)
+    assert installation.recognise(engine, objects, mark=False) == id

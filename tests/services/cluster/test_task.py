@@ -57,3 +57,13 @@ def test_a_worker_looks_for_the_store_until_it_sees_it(
     marker.write(Objects(tmp_path.as_uri()), "this one")
     module._run(1, *given)
     assert worked == [1]
+
+
+def test_a_worker_that_cannot_make_the_folder_of_the_store_does_not_see_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "BLIND", 0)
+    (tmp_path / "file").touch()
+    task = Task("a", "none", "none", {}, Limits(1 << 30, 1 << 26))
+    with pytest.raises(WrongStore, match=f"the worker on {socket.gethostname()}: cannot open the store"):
+        module._run(0, STEPS, (tmp_path / "file" / "store").as_uri(), task, None)
