@@ -3,6 +3,7 @@
 import re
 import threading
 import time
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from services.coordinator.job_kinds import JOB_KINDS
 from services.coordinator.job_run import JobRun, Next
 from services.settings import CoordinatorSettings
 from storage.database.engine import reading, writing
-from storage.errors import CaptureError, EnvmatteError, StoreUnavailable, Unavailable
+from storage.errors import CaptureError, EnvmatteError, NotFound, StoreUnavailable, Unavailable
 from storage.layout import uploads
 from storage.objects.store import Objects
 from storage.records import captures, jobs, leases, mattes, tiles
@@ -98,6 +99,30 @@ def test_job_cancelled_while_it_is_started_is_not_run(
     assert dispatcher.submitted == []
     with reading(engine) as c:
         assert (jobs.get(c, job).state, jobs.get(c, job).started_at) == ("cancelled", None)
+
+
+def test_job_cancelled_after_it_was_read_is_cleaned_up_as_such(
+    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = jobs.to_run
+
+    def cancelled_after(connection: Connection) -> Sequence[Row[Any]]:
+        rows = read(connection)
+        with writing(engine) as c:
+            if jobs.get(c, job).state == "queued":
+                jobs.cancel(c, job)
+        return rows
+
+    def without_its_capture(connection: Connection, row: Row[Any]) -> bool:
+        raise NotFound("its capture is deleted")
+
+    monkeypatch.setattr(jobs, "to_run", cancelled_after)
+    monkeypatch.setattr(JOB_KINDS["ingest"], "is_due", without_its_capture)
+    told: list[str] = []
+    monkeypatch.setattr(JOB_KINDS["ingest"], "cancelled", lambda c, row: told.append(row.id))
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, Idle()):  # type: ignore[arg-type]
+        until(lambda: not objects.paths_below("uploads"))
+    assert told == [job]
 
 
 def test_paused_job_is_not_run_until_it_is_continued(
