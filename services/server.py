@@ -57,7 +57,7 @@ def serve(settings: Settings) -> None:
         _opened(settings, "service", mark=settings.coordinate) as (stack, engine, objects, id),
     ):
         require_keys_unless_loopback(settings, engine)
-        app = build_app(settings, engine, objects, id)
+        app = build_app(settings, engine, objects)
         stack.callback(app.state.context.decoders.close)
         config = uvicorn.Config(
             SecurityHeaders(app),

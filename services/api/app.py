@@ -50,18 +50,11 @@ class App(FastAPI):
         return document
 
 
-def build_app(
-    settings: Settings, engine: Engine, objects: Objects, installation: str | None = None
-) -> FastAPI:
+def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
     """Build the app. All that lasts is in the database and the store, so any number of apps may serve them.
 
     Each has a cache of mattes, decoders and owners' shares of its own: the bounds of memory in the settings are those
     of one app.
-
-    Parameters
-    ----------
-    installation : str, optional
-        What the store is recognised by, see `storage.objects.marker`.
     """
     app = App(
         title="envmatte",
@@ -80,7 +73,7 @@ def build_app(
         Shares(settings.request_memory, settings.request_memory // 2, "request_memory"),
         Shares(BACKDROPS * settings.backdrop_bytes, BACKDROPS // 2 * settings.backdrop_bytes),
     )
-    app.state.checks = health.checks(engine, objects, installation)
+    app.state.checks = health.checks(engine, objects)
     errors.register(app)
     app.add_middleware(tus.Protocol)
     app.add_middleware(tracing.TracingMiddleware)

@@ -4,18 +4,21 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Literal
 
 import anyio.to_thread
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel
 from sqlalchemy import Engine
+from sqlalchemy.exc import SQLAlchemyError
 
 from services.api.jobs.wait_reason import trouble_of
+from storage import installation
 from storage.database.disk_reserve import file_of
 from storage.database.engine import reading
 from storage.disks import require_reserve
-from storage.errors import EnvmatteError
+from storage.errors import EnvmatteError, Unavailable
 from storage.objects import marker
 from storage.objects.store import Objects
 from storage.records import leases
@@ -84,11 +87,13 @@ class Check:
             return found
 
 
-def checks(engine: Engine, objects: Objects, installation: str | None = None) -> dict[str, Check]:
+def checks(engine: Engine, objects: Objects) -> dict[str, Check]:
     """The checks of a service, by their fields in `Readiness`. None of them writes.
 
     Coordinators write their heartbeat to the database all the time, so a database that takes no writes is seen by it.
     """
+
+    id: str | None = None
 
     def last_heartbeat() -> Heartbeat | None:
         with reading(engine) as c:
@@ -101,9 +106,16 @@ def checks(engine: Engine, objects: Objects, installation: str | None = None) ->
         return "ok"
 
     def store() -> str:
+        nonlocal id
         objects.check_reachable()
-        if installation is not None:
-            marker.require(objects, installation)
+        if id is None:  # it stays the same; there is none until a coordinator has started
+            with (
+                suppress(Unavailable, SQLAlchemyError),
+                reading(engine) as c,
+            ):  # which the database's check tells
+                id = installation.find(c)
+        if id is not None:
+            marker.require(objects, id)
         objects.require_reserve()
         return "ok"
 

@@ -17,8 +17,11 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from services.api.mattes import layers
+from services.cli import keys
 from services.cli.main import main
 from services.cli.remote import jobs, mattes
+from services.cli.remote import mattes as remote_mattes
 from services.client import Unreachable
 from services.settings import (
     ClusterSettings,
@@ -27,6 +30,8 @@ from services.settings import (
     Settings,
     describe_settings,
 )
+from storage.database import owners
+from storage.records import api_keys
 from tests.parts.processes import interrupt, running
 from tests.services.client.servers import JOB, ok, refusal, scripted_server, web_server
 
@@ -496,3 +501,8 @@ def test_a_file_without_a_program_is_named(tmp_path: Path) -> None:
         done = CliRunner().invoke(main, command)
         assert done.exit_code == 2
         assert f"{file} has no program: monitor is required" in done.stderr
+
+
+def test_what_commands_know_without_importing_the_service_is_what_it_has() -> None:
+    assert remote_mattes.OF_PLATE == layers.OF_PLATE
+    assert (keys.SCOPES, keys.DEFAULT) == (api_keys.SCOPES, owners.DEFAULT)

@@ -11,6 +11,7 @@ from sqlalchemy import Engine, event
 
 from services.api.system import health
 from services.api.system.health import Check, checks
+from storage import installation
 from storage.objects import marker
 from storage.objects.store import Objects
 
@@ -65,9 +66,9 @@ def test_checks_run_once_in_an_interval_however_often_they_are_asked_for() -> No
     assert 2 <= len(runs) <= 3
 
 
-async def _results(engine: Engine, objects: Objects, installation: str | None = None) -> dict[str, str]:
+async def _results(engine: Engine, objects: Objects) -> dict[str, str]:
     async with asyncio.timeout(60):
-        made = checks(engine, objects, installation)
+        made = checks(engine, objects)
         found = {name: await check.result() for name, check in made.items()}
         while any(text.startswith("no answer") for text in found.values()):
             found = {name: await check.result() for name, check in made.items()}
@@ -108,8 +109,13 @@ def test_no_more_than_the_code_of_what_a_bucket_answers_is_told(
     assert found["store"] in caplog.text
 
 
-def test_another_store_than_that_of_the_installation_is_not_ready(engine: Engine, objects: Objects) -> None:
-    found = asyncio.run(_results(engine, objects, "this one"))["store"]
+def test_another_store_than_that_of_the_installation_is_not_ready(
+    engine: Engine, objects: Objects, tmp_path: Path
+) -> None:
+    assert asyncio.run(_results(engine, objects))["store"] == "ok"  # no coordinator has started yet
+    id = installation.recognise(engine, Objects((tmp_path / "elsewhere").as_uri()))
+    assert id is not None
+    found = asyncio.run(_results(engine, objects))["store"]
     assert found.startswith("this machine does not see the store of this installation")  # without its name
-    marker.write(objects, "this one")
-    assert asyncio.run(_results(engine, objects, "this one"))["store"] == "ok"
+    marker.write(objects, id)
+    assert asyncio.run(_results(engine, objects))["store"] == "ok"
