@@ -45,7 +45,7 @@ def test_a_store_that_refuses_is_named_to_all_who_ask(
     capture_archive: Path, s3: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_transport, "PATIENCE", 1.0)
-    with serving(tmp_path / "data", "--store", s3, ENVMATTE_COORDINATE="false"):
+    with serving(tmp_path / "data", "--store", s3, "--workers", "1"):
         pass  # later starts don't wait for a store that is away
     where = ("--store", s3.replace("envmatte", "another"), "--workers", "1")
     with serving(tmp_path / "data", *where) as service:
