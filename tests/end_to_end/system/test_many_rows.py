@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 
 from storage.database.engine import open_engine, writing
+from storage.objects import marker
+from storage.objects.store import Objects
 from storage.records import captures, jobs, mattes, tiles
 from tests.benchmarks.service.many_rows import calls, fill
 from tests.end_to_end.conftest import serving
@@ -31,6 +33,7 @@ def test_calls_read_few_of_many_rows(tmp_path: Path) -> None:
         mattes.add_imported(c, "m", {}, {}, stored=1)
     fill(engine, JOBS)
     engine.dispose()
+    marker.write(Objects((data / "store").as_uri()), "many rows")  # with nothing in it, it would be refused
     with serving(data, "--workers", "1") as service:
         until(lambda: service.http.get("/readyz").is_success)
         assert f'envmatte_captures{{state="ready"}} {JOBS // 10 + 1}' in service.http.get("/metrics").text
