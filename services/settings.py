@@ -218,9 +218,8 @@ class CoordinatorSettings(ClusterSettings):
             kind = file = ""
         else:
             kind, file = url.get_backend_name(), url.database or ""
-        if (
-            kind == "sqlite" and not Path(file).is_absolute()
-        ):  # SQLite would make a database in memory or wherever
+        # SQLite would make a database in memory, or wherever it was started.
+        if kind == "sqlite" and not Path(file).is_absolute():
             raise ValueError("must name its file from the root on, with four slashes: sqlite:////FILE")
         if kind not in ("sqlite", "postgresql"):  # without showing the URL, which may hold a password
             raise ValueError("must be postgresql://USER:PASSWORD@HOST/NAME or sqlite:////FILE")
@@ -346,17 +345,13 @@ GROUPS = {
     "Logging": ("log", "log_level"),
 }
 """The settings in the order in which people read about them."""
-
-
-OF_CLIENTS = ("url", "key")
-"""What the environment may hold for the commands that talk to a service."""
-OF_COMPOSE = ("image", "listen")
-"""What the file .env may hold for docker/compose.yaml, as it says at its top."""
+OF_OTHERS = ("url", "key", "image", "listen")
+"""What the environment, or .env, may hold for commands that talk to a service, and for docker/compose.yaml."""
 
 
 def warn_of_unknown() -> None:
     """Log which variables and lines of .env set nothing: a misspelt limit would be none."""
-    unknown = unknown_variables({*Settings.model_fields, *OF_CLIENTS, *OF_COMPOSE})
+    unknown = unknown_variables({*Settings.model_fields, *OF_OTHERS})
     if unknown:
         logger.warning(
             "no settings of envmatte, and ignored: %s; `envmatte serve --help` lists all", ", ".join(unknown)

@@ -39,7 +39,8 @@ def recognise(engine: Engine, objects: Objects, *, mark: bool = True) -> str | N
         If it can't be reached to be marked.
     """
     with reading(engine) as c:
-        id, holds = find(c), _holds_anything(c)
+        id = find(c)
+        holds = id is None and _holds_anything(c)
     if id is None:
         if not mark:
             return None
@@ -67,7 +68,7 @@ def recognise(engine: Engine, objects: Objects, *, mark: bool = True) -> str | N
 
 
 def _holds_anything(connection: Connection) -> bool:
-    """Whether the store should hold a capture or a matte, whoever owns it."""
+    """Whether the store should hold a capture or a matte, of any owner."""
     return any(
         connection.scalar(select(table.c.id).where(table.c.state == "ready").limit(1)) is not None
         for table in (captures, mattes)

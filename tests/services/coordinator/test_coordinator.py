@@ -118,11 +118,11 @@ def test_job_cancelled_after_it_was_read_is_cleaned_up_as_such(
 
     monkeypatch.setattr(jobs, "to_run", cancelled_after)
     monkeypatch.setattr(JOB_KINDS["ingest"], "is_due", without_its_capture)
-    told: list[str] = []
-    monkeypatch.setattr(JOB_KINDS["ingest"], "cancelled", lambda c, row: told.append(row.id))
+    ended: list[str] = []
+    monkeypatch.setattr(JOB_KINDS["ingest"], "cancelled", lambda c, row: ended.append(row.id))
     with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, Idle()):  # type: ignore[arg-type]
         until(lambda: not objects.paths_below("uploads"))
-    assert told == [job]
+    assert ended == [job]
 
 
 def test_paused_job_is_not_run_until_it_is_continued(
