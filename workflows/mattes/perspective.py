@@ -11,6 +11,7 @@ from scipy.ndimage import binary_erosion, label
 from storage.layout.mattes import Matte
 from workflows.interruption import checkpoint
 from workflows.mattes.lobes import block_lobes
+from workflows.recovery.camera.homography import fit_homography
 from workflows.threads import in_parts
 
 LOBES = 3
@@ -205,7 +206,7 @@ def find_perspective(places: Places, across: Doubles, down: Doubles, aspect: flo
         return None
     seen = places[..., :2].astype(np.float64)
     x, y, at = across.ravel()[rim], down.ravel()[rim], seen.reshape(-1, 2)[rim]
-    tried = [_homography(x[four], y[four], at[four]) for four in _fours(rim.size)]
+    tried = [fit_homography(x[four], y[four], at[four]) for four in _fours(rim.size)]
     off = np.stack([lengths(sights(one, x, y) - at, aspect) for one in tried])
     for near in (NEAR, ROUGHLY):
         agreed = np.count_nonzero(off < near, axis=1)
@@ -220,7 +221,7 @@ def find_perspective(places: Places, across: Doubles, down: Doubles, aspect: flo
         before, fits = fits, sharp & (lengths(sights(best, across, down) - seen, aspect) < near)
         if (fits == before).all():
             break
-        best = _homography(across[fits], down[fits], seen[fits])
+        best = fit_homography(across[fits], down[fits], seen[fits])
     return best
 
 
@@ -261,17 +262,3 @@ def _rim(sharp: Bools) -> Bools:
     large = sharp & (sizes >= LEAST_PART * np.max(sizes))[parts]
     width = max(1, round(RIM * max(sharp.shape)))
     return np.asarray(large & ~binary_erosion(between(large), iterations=width))
-
-
-def _homography(x: Doubles, y: Doubles, seen: Doubles) -> Doubles:
-    """The (3, 3) homography from (x, y, 1) to ``seen`` (n, 2), by linear least squares; its last entry is 1."""
-    u, v = seen.T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    rows = np.concatenate(
-        [
-            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=1),
-            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=1),
-        ]
-    )
-    found, *_ = np.linalg.lstsq(rows, np.concatenate([u, v]), rcond=None)
-    return np.append(found, 1.0).reshape(3, 3)

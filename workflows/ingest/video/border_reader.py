@@ -11,6 +11,7 @@ from workflows.ingest.video.recording import Recording
 from workflows.ingest.video.signatures import LargeFrames
 from workflows.ingest.video.timing import FoundPatterns
 from workflows.programs.border import LEAD, TICKS, Border, Box, read_numbers
+from workflows.recovery.camera.homography import fit_homography
 
 LOOKS = 6
 """Large frames to take while a pattern is shown."""
@@ -57,10 +58,10 @@ def find_by_numbers(
     Notes
     -----
     An exposure that settles while a pattern is shown divides its plateau: of those that look alike, one is taken. The
-    cells of the sides alternate from each pattern to the next: pixels that do so form two columns, whose ends are
-    four points of the display. Starting from these, the simplex method of Nelder and Mead (1965) searches for the
-    homography (Hartley and Zisserman, 2004, ch. 4) with the largest differences within all pairs of cells. Numbers must
-    ascend in time; what is not in the longest ascending sequence is a misreading.
+    cells of the sides alternate from each pattern to the next: pixels that do so form two columns, whose ends are four
+    points of the display. Starting from these, the simplex method of Nelder and Mead (1965) searches for the homography
+    with the largest differences within all pairs of cells. Numbers must ascend in time; what is not in the longest
+    ascending sequence is a misreading.
     """
     plateaus = [recording.plateau(n) for n in range(len(recording.events) + 1)]
     if len(plateaus) > _PLATEAUS * patterns + 100:
@@ -153,11 +154,11 @@ def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
     first, last = border.left[0], border.left[-1]
     top, bottom = first[1], last[1] + last[3]
     left, right = border.thickness / 2, border.width - border.thickness / 2
-    known = np.array([(left, top), (left, bottom), (right, top), (right, bottom)])
+    x, y = np.array([(left, top), (left, bottom), (right, top), (right, bottom)]).T
     cells = (*border.top, *border.bottom, *border.left, *border.right)
 
     def alike(moved: Doubles) -> float:
-        pairs = _cells(light, _homography(known, ends + moved.reshape(4, 2)), cells)
+        pairs = _cells(light, fit_homography(x, y, ends + moved.reshape(4, 2)), cells)
         return -float(np.abs(pairs[:, ::2] - pairs[:, 1::2]).mean())
 
     simplex = np.concatenate([np.zeros((1, 8)), _SIMPLEX * np.eye(8)])
@@ -169,16 +170,7 @@ def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": 0.02, "maxfev": 600},
     )
-    return _homography(known, ends + best.x.reshape(4, 2))
-
-
-def _homography(known: Points, seen: Points) -> Doubles:
-    """The homography that maps four points to four others, (3, 3) float64."""
-    rows = []
-    for (x, y), (u, v) in zip(known, seen, strict=True):
-        rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
-    solved, *_ = np.linalg.lstsq(np.array(rows), seen.ravel(), rcond=None)
-    return np.append(solved, 1.0).reshape(3, 3)
+    return fit_homography(x, y, ends + best.x.reshape(4, 2))
 
 
 def _cells(light: Floats, homography: Doubles, cells: Sequence[Box]) -> Doubles:

@@ -1,1 +1,1 @@
-"""What a camera adds to the light of the monitor: S and rho, crosstalk, noise."""
+"""What a camera does to the light of the monitor: S and rho, crosstalk, noise, perspective."""
