@@ -48,9 +48,9 @@ class Client:
     """
 
     def __init__(self, url: str, key: str | None = None) -> None:
-        from services.client._transport import Transport
+        from services.client._session import Session
 
-        self._http = Transport(url, key)
+        self._http = Session(url, key)
 
     def __enter__(self) -> Self:
         return self

@@ -13,7 +13,7 @@ from services.client._errors import FileChanged, NotFound, ServiceError, Unreach
 if TYPE_CHECKING:
     import httpx2
 
-    from services.client._transport import Transport
+    from services.client._session import Session
 
 TUS = {"Tus-Resumable": "1.0.0"}
 LARGEST, SMALLEST = 8 << 20, 64 << 10
@@ -23,7 +23,7 @@ TEMPORARY = (408, 409, 423, 429, 460, 500, 502, 503, 504)
 
 
 def send(
-    http: "Transport", file: Path, body: dict[str, Any], progress: Callable[[int, int], None] | None
+    http: "Session", file: Path, body: dict[str, Any], progress: Callable[[int, int], None] | None
 ) -> dict[str, Any]:
     """Upload a file and create a capture from it; returns the answer of the service.
 
@@ -39,7 +39,7 @@ def send(
     The Idempotency-Key is a hash of the file's path, size and modification time, so the client stores nothing about
     the upload.
     """
-    from services.client import _transport
+    from services.client import _session
     from services.client._declared import declared
 
     state = file.stat()
@@ -49,8 +49,8 @@ def send(
     create = TUS | {"Upload-Length": str(size), "Idempotency-Key": key}
     known = declared(file) | {"filename": file.name.encode(errors="replace").decode()}
     create["Upload-Metadata"] = ",".join(f"{name} {_base64(str(one))}" for name, one in known.items())
-    where, offset, step, pause = "", -1, LARGEST, _transport.FIRST_PAUSE
-    give_up = time.monotonic() + _transport.PATIENCE
+    where, offset, step, pause = "", -1, LARGEST, _session.FIRST_PAUSE
+    give_up = time.monotonic() + _session.PATIENCE
 
     def reached(answer: "httpx2.Response") -> int:
         found = int(http.header(answer, "Upload-Offset"))
@@ -69,8 +69,8 @@ def send(
                 while offset < size:
                     source.seek(offset)
                     offset = reached(_patch(http, where, offset, source.read(step)))
-                    step, pause = min(2 * step, LARGEST), _transport.FIRST_PAUSE
-                    give_up = time.monotonic() + _transport.PATIENCE
+                    step, pause = min(2 * step, LARGEST), _session.FIRST_PAUSE
+                    give_up = time.monotonic() + _session.PATIENCE
                 upload = where.rsplit("/", 1)[-1]
                 return http.json("POST", "/v1/captures", json=body | {"upload": upload})
             except NotFound:
@@ -83,10 +83,10 @@ def send(
                 if never_answered or error.status not in TEMPORARY or time.monotonic() + wait > give_up:
                     raise
                 time.sleep(wait)
-                step, pause = max(step // 2, SMALLEST), min(2 * pause, _transport.LONGEST_PAUSE)
+                step, pause = max(step // 2, SMALLEST), min(2 * pause, _session.LONGEST_PAUSE)
 
 
-def _patch(http: "Transport", where: str, offset: int, data: bytes) -> "httpx2.Response":
+def _patch(http: "Session", where: str, offset: int, data: bytes) -> "httpx2.Response":
     if not data:
         raise FileChanged
     digest = base64.b64encode(hashlib.sha256(data).digest()).decode()

@@ -15,7 +15,7 @@ from workflows.ingest.local_gain import Surroundings
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 from workflows.recovery.camera.clipped import bound_clipped
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry, fit_photometry
 from workflows.recovery.normalise import Conditions
 
@@ -30,7 +30,7 @@ FrameOf = Callable[[int], tuple[Floats, Bools]]
 """Returns the light of a frame, (n, channels), and whether it is not clipped, by the frame's index."""
 
 
-class Light(NamedTuple):
+class PatternLight(NamedTuple):
     """The light of each pattern.
 
     Attributes
@@ -48,7 +48,7 @@ class Light(NamedTuple):
     worth: Floats
 
 
-class Measured(NamedTuple):
+class Observations(NamedTuple):
     """What T is recovered from.
 
     Attributes
@@ -56,7 +56,7 @@ class Measured(NamedTuple):
     photometry : Photometry
         S and rho of the n pixels.
     values, usable, worth : (n, m, 3)
-        Those of `Light`, of the m patterns that are measured; clipped values are bounds.
+        Those of `PatternLight`, of the m patterns that are measured; clipped values are bounds.
     """
 
     photometry: Photometry
@@ -95,7 +95,7 @@ def read_light(
     program: Program,
     gain: Surroundings | None,
     wanted: Bools | None = None,
-) -> tuple[Light, Bools]:
+) -> tuple[PatternLight, Bools]:
     """The light of each pattern at the pixels of a rectangle that are to be recovered, and their (y, x) bool mask.
 
     Drift, flicker and local tone mapping are corrected if `workflows.ingest.trial.steadiness` was certain of them,
@@ -161,7 +161,7 @@ def places_in(span: tuple[slice, slice], recovered: Bools) -> NDArray[np.intp]:
     return places
 
 
-def light_of(frame_of: FrameOf, attributes: dict[str, Any], program: Program, pixels: int) -> Light:
+def light_of(frame_of: FrameOf, attributes: dict[str, Any], program: Program, pixels: int) -> PatternLight:
     """Merge the frames of each pattern at some pixels, and correct flicker and crosstalk.
 
     Notes
@@ -180,12 +180,12 @@ def light_of(frame_of: FrameOf, attributes: dict[str, Any], program: Program, pi
     if np.any(crosstalk != np.eye(3)):
         values = (values @ np.linalg.inv(crosstalk).T).astype(np.float32)
         usable = usable & usable.all(axis=2, keepdims=True)
-    return Light(values, usable, worth)
+    return PatternLight(values, usable, worth)
 
 
 def merge(
     frame_of: FrameOf, attributes: dict[str, Any], count: int, pixels: int
-) -> tuple[Light, Floats | None]:
+) -> tuple[PatternLight, Floats | None]:
     """Merge all frames of each of ``count`` patterns; returns their light and, if there are gains, the mean gain.
 
     Notes
@@ -231,7 +231,7 @@ def merge(
     def by_pixel(values: NDArray[Any]) -> NDArray[Any]:
         return np.ascontiguousarray(values.transpose(1, 0, 2))
 
-    return Light(by_pixel(light), by_pixel(usable), by_pixel(worth)), by_pixel(gain) if gains else None
+    return PatternLight(by_pixel(light), by_pixel(usable), by_pixel(worth)), by_pixel(gain) if gains else None
 
 
 def conditions_of(stack: Stack, program: Program) -> Conditions:
@@ -288,9 +288,11 @@ def constants_of(attributes: dict[str, Any], program: Program) -> tuple[NDArray[
     return numbers, sent
 
 
-def measure(light: Light, attributes: dict[str, Any], program: Program, monitor: Curve) -> Measured:
+def measure(
+    light: PatternLight, attributes: dict[str, Any], program: Program, monitor: Curve
+) -> Observations:
     """Fit S and rho to what pixels saw of constant patterns, and bound what is clipped of the others."""
-    noise, (values, usable, worth) = Noise(**attributes["noise"]), light
+    noise, (values, usable, worth) = NoiseModel(**attributes["noise"]), light
     numbers, sent = constants_of(attributes, program)
     photometry = fit_photometry(
         values[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
@@ -298,7 +300,7 @@ def measure(light: Light, attributes: dict[str, Any], program: Program, monitor:
     shown = program.measured
     filmed = np.isin(shown, attributes["patterns"])
     bounded = bound_clipped(values[:, shown], usable[:, shown], worth[:, shown], filmed, photometry, noise)
-    return Measured(photometry, *bounded)
+    return Observations(photometry, *bounded)
 
 
 def black_patterns(program: Program) -> NDArray[np.intp]:

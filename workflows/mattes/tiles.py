@@ -19,7 +19,7 @@ from workflows.mattes.cut_out import CutOut
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.glare import filter_sensing
 from workflows.recovery.dgsr.options import DgsrOptions
@@ -146,7 +146,7 @@ def recover_block(
     """
     program, monitor = program_of(objects, capture)
     attributes = stack.attributes
-    noise = Noise(**attributes["noise"])
+    noise = NoiseModel(**attributes["noise"])
     gain = gain_of(objects, capture)
     light, recovered = read_light(stack, span, program, gain, wanted)
     crosstalk = np.array(attributes["crosstalk"])

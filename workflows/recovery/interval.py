@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.pyramid import Pyramid
 
 COVERED = 0.9
@@ -100,7 +100,7 @@ def fit_interval(
     contrast: NDArray[np.floating],
     variance: NDArray[np.floating],
     rho: float,
-    noise: Noise,
+    noise: NoiseModel,
     frames: float,
     errors: tuple[float, float],
 ) -> Interval:
@@ -113,7 +113,7 @@ def fit_interval(
         measurement, errors of the model included.
     rho : float
         Of a usual pixel.
-    noise : Noise
+    noise : NoiseModel
         Of a frame.
     frames : float
         In which a pixel was seen, all patterns together.

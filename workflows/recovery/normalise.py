@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 
 # Standard deviations that S and S + rho may change by when they are fitted again.
@@ -55,7 +55,7 @@ class Measurements(NamedTuple):
 def normalise(
     measurements: NDArray[np.float32],
     photometry: Photometry,
-    noise: Noise,
+    noise: NoiseModel,
     least_contrast: float,
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.number] | None = None,
@@ -68,7 +68,7 @@ def normalise(
         Linear camera values C. Values that are not finite are ignored.
     photometry : Photometry
         S and rho of the n pixels.
-    noise : Noise
+    noise : NoiseModel
         Noise of one frame.
     least_contrast : float
         A channel whose rho is below this many standard deviations of a mid-grey value is ignored.
@@ -92,7 +92,7 @@ def normalise(
 
     >>> S, rho, variance = (np.full((1, 3), value, np.float32) for value in (0.1, 0.5, 1e-6))
     >>> C = np.full((1, 3, 3), [[0.1], [0.35], [0.6]], np.float32)
-    >>> value, variance = normalise(C, Photometry(S, rho, variance, variance), Noise(1e-5, 0), 3.0)
+    >>> value, variance = normalise(C, Photometry(S, rho, variance, variance), NoiseModel(1e-5, 0), 3.0)
     >>> print(value[0, 0].round(3), variance[0, 0].round(6))
     [-1.  0.  1. -1.  1.] [1.6e-04 1.6e-04 1.6e-04 1.6e-05 1.6e-05]
     """

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Row
 from services.api.context import OwnerContext
 from services.api.http.responses import bytes_response, json_response, utc_time
 from services.api.http.router import Router
-from services.api.http.types import After, Limit, Named
+from services.api.http.types import After, Named, PageSize
 from services.api.jobs.eta import seconds_to_recover
 from services.api.renaming import CHANGE, rename
 from storage.database.engine import reading, writing
@@ -91,7 +91,7 @@ class Captures(BaseModel):
 async def list_captures(
     context: OwnerContext,
     request: Request,
-    limit: Limit = 100,
+    limit: PageSize = 100,
     after: After = None,
     state: Literal["ingesting", "ready", "failed"] | None = None,
     name: Named = None,

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from workflows.untrusted.validation import Name
 
-Limit = Annotated[int, Query(ge=1, le=1000, description="The most items to list.")]
+PageSize = Annotated[int, Query(ge=1, le=1000, description="The most items to list.")]
 After = Annotated[str | None, Query(description="The id of the last item of the previous page.")]
 Named = Annotated[Name | None, Query(description="What is in the name, in upper or lower case.")]
 # Lists and not tuples: few generators of clients know the schema of a tuple.

@@ -16,7 +16,7 @@ from services.api.http.bodies import read_json, schema_of
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.responses import json_response, utc_time
 from services.api.http.router import Router, in_turn
-from services.api.http.types import After, Limit
+from services.api.http.types import After, PageSize
 from services.api.jobs.eta import seconds_left
 from services.api.jobs.situation import Situation
 from services.api.jobs.wait_reason import reason
@@ -283,7 +283,7 @@ def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
 async def list_jobs(
     context: OwnerContext,
     request: Request,
-    limit: Limit = 100,
+    limit: PageSize = 100,
     after: After = None,
     state: State | None = None,
 ) -> Response:
@@ -306,7 +306,7 @@ def get_job(context: OwnerContext, id: str) -> Job:
 
 @router.get("/jobs/{id}/log")
 def get_log(
-    context: OwnerContext, id: str, limit: Limit = 1000, after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0
+    context: OwnerContext, id: str, limit: PageSize = 1000, after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0
 ) -> Log:
     """The log of a job, line by line."""
     with reading(context.engine) as c:

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Row
 from services.api.context import OwnerContext
 from services.api.http.responses import json_response, utc_time
 from services.api.http.router import Router
-from services.api.http.types import After, Limit, Named, Pair
+from services.api.http.types import After, Named, PageSize, Pair
 from services.api.renaming import CHANGE, rename
 from storage.database.engine import reading, writing
 from storage.database.rows import page
@@ -77,7 +77,7 @@ class Mattes(BaseModel):
 async def list_mattes(
     context: OwnerContext,
     request: Request,
-    limit: Limit = 100,
+    limit: PageSize = 100,
     after: After = None,
     state: Literal["recovering", "ready", "failed"] | None = None,
     capture: str | None = None,

@@ -12,7 +12,7 @@ from services.api.context import OwnerContext
 from services.api.http.bodies import read_json, schema_of
 from services.api.http.responses import json_response
 from services.api.http.router import Router
-from services.api.http.types import After, Limit
+from services.api.http.types import After, PageSize
 from services.api.limits.quotas import admit
 from storage.database.engine import reading, writing
 from storage.database.rows import page
@@ -195,7 +195,7 @@ def post_program(
 
 @router.get("/programs", response_model=Programs)
 async def list_programs(
-    context: OwnerContext, request: Request, limit: Limit = 100, after: After = None
+    context: OwnerContext, request: Request, limit: PageSize = 100, after: After = None
 ) -> Response:
     """Programs, newest first, without their parts."""
 

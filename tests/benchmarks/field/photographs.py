@@ -25,7 +25,7 @@ from tests.benchmarks.recovery.solvers import Recover
 from workflows.images.tone_curves import to_light
 from workflows.ingest.measured_light import constants_of, read_light
 from workflows.mattes import tiles
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import fit_photometry
 from workflows.recovery.glare import add_glare
 
@@ -136,7 +136,7 @@ def _methods(
     whole = slice(0, stack.height), slice(0, stack.width)
     (light, usable, worth), _ = read_light(stack, whole, program, tiles.gain_of(objects, capture))
     light, usable, worth = light[chosen], usable[chosen], worth[chosen]
-    noise = Noise(**attributes["noise"])
+    noise = NoiseModel(**attributes["noise"])
     numbers, sent = constants_of(attributes, program)
     levels = to_light(sent, monitor)
     photometry = fit_photometry(light[:, numbers], levels, usable[:, numbers], noise, worth[:, numbers])

@@ -32,7 +32,7 @@ from solvers import Recover, lasso, least_squares, pursuit, rival
 from workflows.images.resample import area_mean
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.options import DgsrOptions
@@ -55,7 +55,7 @@ class Take:
     measurements: NDArray[np.float32]
     photometry: Photometry
     sensing: Sensing
-    noise: Noise
+    noise: NoiseModel
     program: Program
 
 
@@ -186,7 +186,7 @@ def _lobes(
     measurements: NDArray[np.float32],
     photometry: Photometry,
     sensing: Sensing,
-    noise: Noise,
+    noise: NoiseModel,
 ) -> Transport:
     return lobes.recover(measurements, photometry, patterns, noise).transport
 

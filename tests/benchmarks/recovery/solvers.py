@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.dgsr.groups import Rows
 from workflows.recovery.normalise import normalise
 from workflows.recovery.sensing import Sensing
 from workflows.recovery.transport import Transport
 
-Recover = Callable[[NDArray[np.float32], Photometry, Sensing, Noise], Transport]
+Recover = Callable[[NDArray[np.float32], Photometry, Sensing, NoiseModel], Transport]
 Solve = Callable[[NDArray[np.float64], NDArray[np.float64], float, int], NDArray[np.float64]]
 
 
@@ -28,7 +28,7 @@ def rival(solve: Solve, levels: str) -> Recover:
     """A method that solves for T pixel by pixel and channel by channel."""
 
     def recover(
-        measurements: NDArray[np.float32], photometry: Photometry, sensing: Sensing, noise: Noise
+        measurements: NDArray[np.float32], photometry: Photometry, sensing: Sensing, noise: NoiseModel
     ) -> Transport:
         measured = normalise(measurements, photometry, noise, 3.0)
         index = np.arange(3 * len(measurements)).reshape(-1, 3)

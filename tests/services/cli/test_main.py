@@ -293,7 +293,7 @@ def test_exit_code_130_and_a_way_to_continue_after_an_interrupted_recovery() -> 
 def test_a_service_that_stops_while_a_command_waits_is_reported(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("services.client._transport.PATIENCE", 0.5)
+    monkeypatch.setattr("services.client._session.PATIENCE", 0.5)
     with scripted_server(lambda n: ok() if n < 2 else None) as (url, _):
         given_up = CliRunner().invoke(main, ["recover", "c", "--url", url])
     assert isinstance(given_up.exception, Unreachable)

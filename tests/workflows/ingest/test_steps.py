@@ -25,7 +25,7 @@ from tests.workflows.ingest.video.films import CAMERA, PROGRAM, IngestFilm, prog
 from workflows.images.integer_formats import encode_png
 from workflows.ingest import steps, stills
 from workflows.jobs import Task
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
 from workflows.untrusted.limits import Limits
@@ -279,7 +279,7 @@ def test_measured_noise_is_that_of_the_camera(ingest: Ingest) -> None:
     scene = glass_ball(80, 60, monitor=(64, 48), rays=4)
     target = io.BytesIO()
     write_capture(scene, nested_program((64, 48), bands=((4, 3, 2),), levels=8), target, noise=2.0, depth=16)
-    noise = Noise(**ingest("c", target.getvalue()).attributes["noise"])
+    noise = NoiseModel(**ingest("c", target.getvalue()).attributes["noise"])
     for value in (0.05, 0.3, 0.8):
         # The simulated camera's deviation is 0.002 + 0.006 sqrt(value), times `noise`.
         deviation = float(noise.variance(np.array([value], np.float32))[0]) ** 0.5

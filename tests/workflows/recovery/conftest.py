@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Level, Patterns, Sensing
@@ -15,7 +15,7 @@ Bands = list[tuple[int, int, int]]
 SensingOf = Callable[..., Sensing]
 PatternsOf = Callable[..., Patterns]
 Gaussian = Callable[..., NDArray[np.float64]]
-Scene = tuple[NDArray[np.float32], Photometry, Noise]
+Scene = tuple[NDArray[np.float32], Photometry, NoiseModel]
 Observe = Callable[..., Scene]
 
 
@@ -61,7 +61,7 @@ def _observe(
 ) -> Scene:
     """Noisy measurements of true rows (n, 3, cells) on the finest grid."""
     rng = np.random.default_rng(seed)
-    noise = Noise(4e-6, 5e-5)
+    noise = NoiseModel(4e-6, 5e-5)
     S = np.full(truth.shape[:2], 0.02, np.float32)
     factor = np.broadcast_to(np.asarray(rho, np.float32), truth.shape[:2]).copy()
     photometry = Photometry(S, factor, noise.variance(S) / 4, noise.variance(S + factor) / 4)

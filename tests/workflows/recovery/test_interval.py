@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.interval import Interval, fit_interval, local_contrast
 from workflows.recovery.pyramid import Pyramid
 
-NOISE = Noise(1e-5, 1e-4)
+NOISE = NoiseModel(1e-5, 1e-4)
 
 
 def contrast_of(mean: np.ndarray, square: np.ndarray) -> tuple[Pyramid, np.ndarray]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.normalise import (
     Measurements,
@@ -12,7 +12,7 @@ from workflows.recovery.normalise import (
     refit_photometry,
 )
 
-NOISE = Noise(4e-6, 5e-5)
+NOISE = NoiseModel(4e-6, 5e-5)
 
 
 @pytest.fixture

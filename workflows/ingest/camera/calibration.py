@@ -16,7 +16,7 @@ from workflows.ingest.camera.lit import find_lit, windows
 from workflows.ingest.local_gain import Surroundings, local_gain
 from workflows.ingest.measured_light import clipped_from, exposures_of
 from workflows.programs.program import Program
-from workflows.recovery.camera.noise import Noise, estimate_excess
+from workflows.recovery.camera.noise import NoiseModel, estimate_excess
 from workflows.recovery.camera.photometry import estimate_crosstalk, estimate_noise
 
 SAMPLES = 20_000
@@ -247,8 +247,8 @@ def _compressed(
     exposed: NDArray[np.float64] | None,
     constants: Sequence[int],
     shown: NDArray[np.float32],
-    noise: Noise,
-) -> Noise:
+    noise: NoiseModel,
+) -> NoiseModel:
     """The noise of a video's frames, which compression makes larger for patterns than for constant frames.
 
     Each mean frame counts as one frame, because averaging does not remove compression noise.

@@ -18,7 +18,7 @@ from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
 from workflows.ingest.report.colour_detail import ColourDetail
 from workflows.programs.program import Program
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 
 EDGE = 96
 """Largest side of a window in pixels. Four by four windows are spread over what sees the monitor."""
@@ -110,7 +110,7 @@ class _Windows:
     def __init__(self, stack: Stack, frames: _Frames) -> None:
         self._stack, self._frames = stack, frames
         self._look_up, self._top, self._gain = look_up_of(stack), clipped_from(stack), local_gain(stack)
-        self._noise = Noise(**stack.attributes["noise"])
+        self._noise = NoiseModel(**stack.attributes["noise"])
         self._pixels = 0
         self._clipped = np.zeros(
             (2, len(frames.chosen)), np.int64

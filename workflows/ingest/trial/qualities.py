@@ -12,9 +12,9 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
-from workflows.ingest.trial.trial_recovery import RecoveredSample, Sample, recover_seen, see_sample
+from workflows.ingest.trial.trial_recovery import PixelSample, RecoveredSample, recover_seen, see_sample
 from workflows.programs.program import Bernoulli, Program
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.interval import HELD_OUT, Interval, fit_interval, local_contrast
 from workflows.recovery.lobes.options import FAST, FINE
 from workflows.recovery.sensing import Patterns
@@ -32,7 +32,7 @@ SHARPENED = 1.35
 sharpened as the glass is."""
 
 
-class Quality(NamedTuple):
+class QualityTrial(NamedTuple):
     """What is to be expected of a recovery.
 
     Attributes
@@ -47,14 +47,14 @@ class Quality(NamedTuple):
     interval: Interval | None
 
 
-def try_qualities(stack: Stack, sample: Sample, patterns: Patterns) -> dict[str, Quality] | None:
+def try_qualities(stack: Stack, sample: PixelSample, patterns: Patterns) -> dict[str, QualityTrial] | None:
     """Recover some pixels by each quality, with all patterns and without some; None if there is too little contrast.
 
     Parameters
     ----------
     stack : Stack
         With its attributes after `find_steadiness`.
-    sample : Sample
+    sample : PixelSample
         As from `take_sample`. Some of its squares are tried.
     patterns : Patterns
         As from `find_steadiness`.
@@ -103,7 +103,7 @@ def try_qualities(stack: Stack, sample: Sample, patterns: Patterns) -> dict[str,
         name: _interval(stack, program, found, *prediction, chosen)
         for (name, found), prediction in zip(without.items(), predictions, strict=True)
     }
-    return {name: Quality(taken, intervals.get(name)) for name, taken in seconds.items()}
+    return {name: QualityTrial(taken, intervals.get(name)) for name, taken in seconds.items()}
 
 
 def _seconds(recover: Callable[[], RecoveredSample | None]) -> float | None:
@@ -127,7 +127,7 @@ def _interval(
 ) -> Interval | None:
     """The interval by what a recovery predicts of some patterns; None if too little of these was seen."""
     attributes, channels, photometry = stack.attributes, stack.channels, found.photometry
-    noise, model_error = Noise(**attributes["noise"]), float(attributes["model_error"])
+    noise, model_error = NoiseModel(**attributes["noise"]), float(attributes["model_error"])
     shown = program.measured[chosen]
     light, worth = found.light.values[:, shown], found.light.worth[:, shown]
     if found.stray is not None:

@@ -19,7 +19,7 @@ from workflows.ingest.trial.tone_mapping import find_tone_mapping
 from workflows.ingest.trial.trial_recovery import (
     FURTHEST,
     Doubles,
-    Sample,
+    PixelSample,
     Trial,
     measure_rest,
     take_sample,
@@ -66,7 +66,7 @@ QUARTERS = 4
 
 
 def find_steadiness(
-    stack: Stack, sample: Sample | None, border: BorderValues | None = None
+    stack: Stack, sample: PixelSample | None, border: BorderValues | None = None
 ) -> Patterns | None:
     """Find the shift and the gain of each frame, and annotate the stack with them.
 
@@ -80,7 +80,7 @@ def find_steadiness(
     ----------
     stack : Stack
         With its attributes after `measure`.
-    sample : Sample, optional
+    sample : PixelSample, optional
         As from `take_sample`.
     border : BorderValues, optional
         Of a film with a border.
@@ -229,7 +229,7 @@ def _believed(before: float, after: float) -> NDArray[np.bool_]:
     return believed
 
 
-def _beyond_mask(stack: Stack, sample: Sample) -> Sample:
+def _beyond_mask(stack: Stack, sample: PixelSample) -> PixelSample:
     """A sample of all that sees the monitor, given that of what is to be recovered.
 
     The bare monitor tells what a camera does better than glass, whose T explains some of it.
@@ -238,7 +238,7 @@ def _beyond_mask(stack: Stack, sample: Sample) -> Sample:
 
 
 def _explain(
-    stack: Stack, program: Program, sample: Sample, wide: Sample, border: BorderValues | None
+    stack: Stack, program: Program, sample: PixelSample, wide: PixelSample, border: BorderValues | None
 ) -> tuple[Curve, Patterns, Unexplained] | None:
     """Find what T leaves unexplained in a sample, local tone mapping first, by a wide one; None if the former has too
     little contrast.

@@ -10,7 +10,7 @@ from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderLight
 from workflows.ingest.local_gain import DARK, DISPLAY, Surroundings, surroundings
 from workflows.ingest.trial.border_tone_mapping import Power, border_power
-from workflows.ingest.trial.trial_recovery import HUBER, Doubles, Sample
+from workflows.ingest.trial.trial_recovery import HUBER, Doubles, PixelSample
 from workflows.ingest.trial.unexplained import DETAIL, MIN_FLAT, SEEN, Rest
 
 WIDTHS = (1 / 40, 1 / 20, 1 / 10)
@@ -34,7 +34,7 @@ SPREAD = 0.01
 def find_tone_mapping(
     stack: Stack,
     rest: Rest,
-    sample: Sample,
+    sample: PixelSample,
     known: dict[str, float] | None,
     border: BorderLight | None = None,
 ) -> dict[str, float] | None:
@@ -46,7 +46,7 @@ def find_tone_mapping(
     stack : Stack
     rest : Rest
         What the recovery of the sample leaves unexplained.
-    sample : Sample
+    sample : PixelSample
     known : dict, optional
         What was found, and corrected, before: the rest is added to it.
     border : BorderLight, optional
@@ -96,7 +96,7 @@ def find_tone_mapping(
     return {"power": power, "width": width, "usual": float(np.log(MIDDLE + DARK)), "spread": spread}
 
 
-def _power_of(rest: Rest, at: NDArray[np.bool_], sample: Sample) -> Callable[[Surroundings], Power]:
+def _power_of(rest: Rest, at: NDArray[np.bool_], sample: PixelSample) -> Callable[[Surroundings], Power]:
     """A function from surroundings to the power that some residuals of a sample, (n, channels, m), show."""
     pixel, channel, shown = np.nonzero(at)
     frame = rest.frames[shown]

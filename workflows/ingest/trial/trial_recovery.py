@@ -14,7 +14,7 @@ from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import (
     LOBES,
-    Light,
+    PatternLight,
     clipped_from,
     conditions_of,
     even_out,
@@ -25,7 +25,7 @@ from workflows.ingest.measured_light import (
     unclipped_light,
 )
 from workflows.programs.program import Program
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.recover import Recovery, recover
@@ -66,7 +66,7 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 
-class Sample(NamedTuple):
+class PixelSample(NamedTuple):
     """Pixels of some squares in all frames.
 
     Attributes
@@ -94,12 +94,12 @@ class Sample(NamedTuple):
         """Row and column of each pixel in the frame, (2, n)."""
         return self.corners[self.chosen[0]].T + self.chosen[1:]
 
-    def thinned(self, most: int) -> "Sample":
+    def thinned(self, most: int) -> "PixelSample":
         """The same squares with at most so many of the chosen pixels, spread over all of them."""
         step = -(-len(self.chosen[0]) // most)
         return self._replace(chosen=tuple(axis[::step] for axis in self.chosen))
 
-    def some_squares(self) -> "Sample":
+    def some_squares(self) -> "PixelSample":
         """All pixels of some of the squares, about as many as were chosen."""
         step = -(-len(self.every[0]) // len(self.chosen[0]))
         whole = self.every[0] % step == 0
@@ -132,7 +132,7 @@ class Trial(NamedTuple):
     residual: float
 
 
-def take_sample(stack: Stack, masked: bool = True) -> Sample | None:
+def take_sample(stack: Stack, masked: bool = True) -> PixelSample | None:
     """Choose squares spread over the pixels to recover that see the monitor, and pixels in them; None if there are too
     few. Unless ``masked``, all that see the monitor are taken for those to recover.
     """
@@ -154,11 +154,11 @@ def take_sample(stack: Stack, masked: bool = True) -> Sample | None:
     every = np.nonzero(inside)
     limit = max(min(PIXELS, VALUES // stack.frames), MIN_PIXELS)
     count = int(np.count_nonzero(wanted))
-    whole = Sample(np.stack(squares, axis=1), every, every, count, np.array(corners, np.intp))
+    whole = PixelSample(np.stack(squares, axis=1), every, every, count, np.array(corners, np.intp))
     return whole.thinned(limit)
 
 
-def see_sample(stack: Stack, sample: Sample, shifts: Doubles) -> Seen:
+def see_sample(stack: Stack, sample: PixelSample, shifts: Doubles) -> Seen:
     """The sample in frames that are shifted back."""
     look_up = look_up_of(stack)
     square, y, x = sample.chosen
@@ -188,7 +188,7 @@ class RecoveredSample(NamedTuple):
 
     Attributes
     ----------
-    light : Light
+    light : PatternLight
         Of each pattern, at the n pixels of the sample.
     photometry : Photometry
     transport : Transport
@@ -202,7 +202,7 @@ class RecoveredSample(NamedTuple):
     seen : Seen
     """
 
-    light: Light
+    light: PatternLight
     photometry: Photometry
     transport: Transport
     strays: Floats
@@ -212,7 +212,7 @@ class RecoveredSample(NamedTuple):
 
 
 def recover_sample(
-    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
+    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: PixelSample, state: Doubles
 ) -> RecoveredSample | None:
     """Recover the sample from frames corrected by ``state``, (frames, 3); None if it has too little contrast."""
     seen = see_sample(stack, sample, state[:, :2])
@@ -242,7 +242,7 @@ def recover_seen(
         Patterns, as numbers among those measured, that are not used.
     """
     attributes = stack.attributes | {"gains": np.exp(gains).tolist() if gains.any() else None}
-    noise = Noise(**attributes["noise"])
+    noise = NoiseModel(**attributes["noise"])
     found = light_of(lambda n: (seen.values[n], seen.whole[n]), attributes, program, seen.values.shape[1])
     photometry, measurements, used, worth = measure(found, attributes, program, monitor)
     alive = photometry.rho**2 > CONTRAST**2 * noise.variance(photometry.S + photometry.rho / 2)
@@ -279,7 +279,7 @@ def _joined(parts: list[Recovery]) -> Recovery:
 
 
 def try_recovery(
-    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
+    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: PixelSample, state: Doubles
 ) -> Trial | None:
     """Recover the sample from frames corrected by ``state``, (frames, 3), and measure what remains."""
     found = recover_sample(stack, program, monitor, patterns, sample, state)
@@ -291,14 +291,14 @@ def measure_rest(
     program: Program,
     monitor: Curve,
     patterns: Patterns,
-    sample: Sample,
+    sample: PixelSample,
     state: Doubles,
     found: RecoveredSample,
 ) -> Trial:
     """Measure how the frames differ from what the recovery of a sample predicts."""
     photometry, transport, alive, seen = found.photometry, found.transport, found.alive, found.seen
     attributes, gains = stack.attributes, np.exp(state[:, 2])
-    noise, model_error = Noise(**attributes["noise"]), attributes["model_error"]
+    noise, model_error = NoiseModel(**attributes["noise"]), attributes["model_error"]
     numbers, sent = program.constants_among(attributes["patterns"])
     shown = program.measured
     predicted = np.zeros((program.count, *alive.shape), np.float32)

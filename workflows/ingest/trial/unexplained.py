@@ -10,13 +10,13 @@ from workflows.images.tone_curves import Curve
 from workflows.ingest.trial.trial_recovery import (
     Doubles,
     Floats,
+    PixelSample,
     RecoveredSample,
-    Sample,
     predict,
     recover_sample,
 )
 from workflows.programs.program import Program
-from workflows.recovery.camera.noise import LEAST_READ, Noise, fit_noise
+from workflows.recovery.camera.noise import LEAST_READ, NoiseModel, fit_noise
 from workflows.recovery.glare import LEAST, Spread, centres, filter_patterns, fit_shares, spread_patterns
 from workflows.recovery.normalise import normalise
 from workflows.recovery.pyramid import Pyramid
@@ -61,7 +61,7 @@ class Unexplained(NamedTuple):
 
 
 def find_unexplained(
-    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: Sample, state: Doubles
+    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: PixelSample, state: Doubles
 ) -> Unexplained | None:
     """Estimate what T leaves unexplained in a sample of the pixels, and annotate the stack with it.
 
@@ -79,7 +79,7 @@ def find_unexplained(
     monitor : Curve
     patterns : Patterns
         The program's, without glare.
-    sample : Sample
+    sample : PixelSample
     state : (frames, 3) float64
         Shifts and logarithms of the gains to correct.
 
@@ -98,7 +98,7 @@ def find_unexplained(
     composites have little of them, since patterns are many.
     """
     stack.annotate(glare=None, model_error=0.0, smooth_error=0.0, pattern_error=None)
-    before, assumed = Noise(**stack.attributes["noise"]), stack.attributes["assumed_noise"]
+    before, assumed = NoiseModel(**stack.attributes["noise"]), stack.attributes["assumed_noise"]
     noise, of_patterns = before, stack.attributes["noise_of_patterns"]
     spreads, through = spread_patterns(patterns), patterns
     shares, error = np.zeros(len(spreads)), 0.0
@@ -142,7 +142,7 @@ class Rest:
         patterns: Patterns,
         through: Patterns,
         spreads: list[Spread],
-        noise: Noise,
+        noise: NoiseModel,
     ) -> None:
         shown, channels, self.noise = program.measured, stack.channels, noise
         self.filmed = "video" in stack.attributes
@@ -190,7 +190,7 @@ class Rest:
         """Root mean square of the residuals, in camera units."""
         return float(np.sqrt(np.mean((self.rest[self.known] * self.rho[self.known] / 2) ** 2)))
 
-    def noise_and_error(self, noise: Noise, assumed: bool) -> tuple[Noise, float]:
+    def noise_and_error(self, noise: NoiseModel, assumed: bool) -> tuple[NoiseModel, float]:
         """The noise of a frame and the error of the model.
 
         The noise of constant frames, unless it is only assumed, is kept if that of patterns is about the same. JPEG and
@@ -231,7 +231,7 @@ class Rest:
         error = float(np.sqrt(max(common, 0.0)) / 2)
         return noise, error if error >= LEAST_ERROR else 0.0
 
-    def smooth_error(self, sample: Sample, otherwise: float) -> float:
+    def smooth_error(self, sample: PixelSample, otherwise: float) -> float:
         """The error of the model in a film by pixels above each other, where both see a pattern alike."""
         if not self.filmed:
             return otherwise

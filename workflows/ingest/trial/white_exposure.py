@@ -6,7 +6,7 @@ import numpy as np
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
-from workflows.ingest.trial.trial_recovery import Sample, try_recovery
+from workflows.ingest.trial.trial_recovery import PixelSample, try_recovery
 from workflows.ingest.trial.unexplained import MEASURED, find_unexplained
 from workflows.programs.program import Program
 from workflows.recovery.sensing import Patterns
@@ -18,7 +18,7 @@ EXACT = 0.01
 
 
 def find_white_excess(
-    stack: Stack, program: Program, monitor: Curve, light: Patterns, sample: Sample
+    stack: Stack, program: Program, monitor: Curve, light: Patterns, sample: PixelSample
 ) -> float:
     """The logarithm of the factor by which the border overestimates the exposure of white, if that was free.
 
@@ -31,7 +31,7 @@ def find_white_excess(
     monitor : Curve
     light : Patterns
         The program's, without glare.
-    sample : Sample
+    sample : PixelSample
         Of all that sees the monitor.
 
     Returns

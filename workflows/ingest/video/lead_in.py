@@ -11,7 +11,7 @@ _OFF = 0.15  # seconds that a change may be early or late
 _ALIKE = 0.15  # largest difference of two blacks, or two whites, as a share of that between black and white
 
 
-class Patterns(NamedTuple):
+class PatternSpan(NamedTuple):
     """The part of a recording that shows the patterns.
 
     Attributes
@@ -29,7 +29,7 @@ class Patterns(NamedTuple):
     ends: bool
 
 
-def find_patterns(recording: Recording) -> Patterns:
+def find_patterns(recording: Recording) -> PatternSpan:
     """Find the patterns between the lead-in and the lead-out.
 
     Parameters
@@ -39,7 +39,7 @@ def find_patterns(recording: Recording) -> Patterns:
 
     Returns
     -------
-    Patterns
+    PatternSpan
         All of the recording if neither is found.
 
     Notes
@@ -60,7 +60,7 @@ def find_patterns(recording: Recording) -> Patterns:
         first = int(np.searchsorted(times, begin)) - start
     if ends:
         stop = int(np.searchsorted(times, middle[leads[-1]] - LEAD_SECONDS[0] / 2))
-    return Patterns(slice(start, stop), first, ends)
+    return PatternSpan(slice(start, stop), first, ends)
 
 
 def begin_at(recording: Recording, first: int) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 
 NARROWEST = 0.1
@@ -15,21 +15,26 @@ Bools = NDArray[np.bool_]
 
 
 def bound_clipped(
-    measurements: Floats, usable: Bools, worth: Floats, filmed: Bools, photometry: Photometry, noise: Noise
+    measurements: Floats,
+    usable: Bools,
+    worth: Floats,
+    filmed: Bools,
+    photometry: Photometry,
+    noise: NoiseModel,
 ) -> tuple[Floats, Bools, Floats]:
     """Replace clipped values by what the light can have been, to be used with less weight.
 
     Parameters
     ----------
     measurements, worth : (n, m, 3) float32
-        See `workflows.ingest.measured_light.Light`.
+        See `workflows.ingest.measured_light.PatternLight`.
     usable : (n, m, 3) bool
         False where a value, or with crosstalk that of another channel, is clipped.
     filmed : (m,) bool
         False where there is no frame of a pattern.
     photometry : Photometry
         S and rho of the n pixels.
-    noise : Noise
+    noise : NoiseModel
 
     Returns
     -------

@@ -17,7 +17,7 @@ _TRIM, _TRIMMED_CHI_SQUARE = 0.9, 0.623011
 
 
 @dataclass(frozen=True)
-class Noise:
+class NoiseModel:
     """Noise of one frame: a linear camera value v has the variance ``read + shot * max(v, 0)``.
 
     Attributes
@@ -39,7 +39,7 @@ class Noise:
 
 def fit_noise(
     level: NDArray[np.floating], square: NDArray[np.floating], floor: float, *, trim: float = _TRIM
-) -> Noise | None:
+) -> NoiseModel | None:
     """Fit noise to samples of squared errors.
 
     Parameters
@@ -55,7 +55,7 @@ def fit_noise(
 
     Returns
     -------
-    Noise or None
+    NoiseModel or None
         None if there are fewer than 120 samples.
 
     Examples
@@ -82,7 +82,7 @@ def fit_noise(
     weight = np.sqrt([b.size for b in bins])
     design = np.stack([np.ones(len(bins)), np.maximum(middle, 0)], axis=1) * (weight / variance)[:, None]
     (read, shot), _ = nnls(design, weight)
-    return Noise(max(float(read), floor), float(shot))
+    return NoiseModel(max(float(read), floor), float(shot))
 
 
 def estimate_excess(
@@ -90,7 +90,7 @@ def estimate_excess(
     black: NDArray[np.float32],
     white: NDArray[np.float32],
     usable: NDArray[np.bool_],
-) -> Noise | None:
+) -> NoiseModel | None:
     """Estimate the noise of pattern frames from values below black or above white, which only noise can cause.
 
     Lossy compression makes it differ from the noise of constant monitors.
@@ -106,7 +106,7 @@ def estimate_excess(
 
     Returns
     -------
-    Noise or None
+    NoiseModel or None
         None if too few values are outside the range from black to white.
 
     Notes

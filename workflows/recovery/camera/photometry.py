@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.camera.noise import LEAST_READ, LEAST_SAMPLES, Noise, fit_noise
+from workflows.recovery.camera.noise import LEAST_READ, LEAST_SAMPLES, NoiseModel, fit_noise
 
 TYPICAL_SHOT = 1 / 20_000
 """Shot noise of a full well of 20,000 electrons."""
@@ -51,7 +51,7 @@ def fit_photometry(
     values: NDArray[np.float32],
     levels: NDArray[np.float32],
     usable: NDArray[np.bool_],
-    noise: Noise,
+    noise: NoiseModel,
     frames: NDArray[np.number],
 ) -> Photometry:
     """Fit S and rho to frames of constant monitors.
@@ -64,7 +64,7 @@ def fit_photometry(
         Light of each monitor by channel, 0 to 1.
     usable : (n, k, 3) bool
         False where a value must be ignored, as where the camera clipped it.
-    noise : Noise
+    noise : NoiseModel
         Noise of one frame.
     frames : (k,) or (n, k, 3) number
         Frames averaged into each value, above 0; a longer exposure counts as several.
@@ -89,7 +89,7 @@ def fit_photometry(
     --------
     >>> values = np.full((1, 2, 3), [[0.1], [0.7]], np.float32)
     >>> levels = np.full((2, 3), [[0], [1]], np.float32)
-    >>> found = fit_photometry(values, levels, values > 0, Noise(1e-6, 0), np.ones(2))
+    >>> found = fit_photometry(values, levels, values > 0, NoiseModel(1e-6, 0), np.ones(2))
     >>> print(found.S.round(3), found.rho.round(3))
     [[0.1 0.1 0.1]] [[0.6 0.6 0.6]]
     """
@@ -123,7 +123,7 @@ def estimate_noise(
     levels: NDArray[np.float32],
     usable: NDArray[np.bool_],
     quantum: float,
-) -> Noise:
+) -> NoiseModel:
     """Estimate the noise of a frame from the residuals of constant monitors' values to the line of eq. 6.
 
     Parameters
@@ -139,7 +139,7 @@ def estimate_noise(
 
     Returns
     -------
-    Noise
+    NoiseModel
         With fewer than four levels or too few usable values, the noise of a typical sensor (a full well of 20,000
         electrons, read noise of 0.15 % of full scale) plus that of quantisation.
 
@@ -162,7 +162,7 @@ def estimate_noise(
     """
     _check_shapes(values, levels, usable)
     floor = max(quantum**2 / 12, LEAST_READ)
-    typical = Noise(TYPICAL_READ + floor, TYPICAL_SHOT)
+    typical = NoiseModel(TYPICAL_READ + floor, TYPICAL_SHOT)
     channels = range(3) if len(levels) >= 4 else ()
     step = max(1, -(-values.shape[0] // _SAMPLE))
     found = [_residuals(values[::step, :, c], levels[:, c], usable[::step, :, c]) for c in channels]

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.dgsr.gaussian_prior import filter_rows
 from workflows.recovery.dgsr.groups import Rows
@@ -32,7 +32,7 @@ def recover(
     measurements: NDArray[np.float32],
     photometry: Photometry,
     sensing: Sensing,
-    noise: Noise,
+    noise: NoiseModel,
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.number] | None = None,
     options: DgsrOptions = DEFAULT,
@@ -48,7 +48,7 @@ def recover(
         S and rho of the pixels.
     sensing : Sensing
         The program's levels, coarse to fine.
-    noise : Noise
+    noise : NoiseModel
         Noise of one frame.
     usable : (n, m, 3) bool, optional
         False where a measurement must be ignored, as where the camera clipped it. Default: all are usable.
@@ -96,7 +96,8 @@ def recover(
     >>> sensing = Sensing((Level(8, 6, np.arange(40), light),))
     >>> S, rho, variance = (np.full((1, 3), value, np.float32) for value in (0.1, 0.7, 1e-6))
     >>> measurements = (S + rho * light[0, 21, :, np.newaxis])[np.newaxis]
-    >>> transport = recover(measurements, Photometry(S, rho, variance, variance), sensing, Noise(1e-6, 0))
+    >>> photometry = Photometry(S, rho, variance, variance)
+    >>> transport = recover(measurements, photometry, sensing, NoiseModel(1e-6, 0))
     >>> transport.cell.tolist(), transport.weight.tolist()
     ([21, 21, 21], [1.0, 1.0, 1.0])
     """

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.fitting.averages import KEPT, adjacent, average_fits
 from workflows.recovery.lobes.fitting.fits import Fits, Pixels, make_buffers
@@ -58,7 +58,7 @@ def recover(
     measurements: NDArray[np.float32],
     photometry: Photometry,
     patterns: Patterns,
-    noise: Noise,
+    noise: NoiseModel,
     usable: NDArray[np.bool_] | None = None,
     frames: NDArray[np.number] | None = None,
     options: LobesOptions = FINE,
@@ -75,7 +75,7 @@ def recover(
         S and rho of the pixels, from constant monitors.
     patterns : Patterns
         The patterns' light on a pyramid over the monitor.
-    noise : Noise
+    noise : NoiseModel
         Noise of one frame.
     usable : (n, m, 3) bool, optional
         False where a value must be ignored, as where the camera clipped it. Default: all are usable.
@@ -118,7 +118,7 @@ def recover(
     >>> S, rho, variance = (np.full((1, 3), value, np.float32) for value in (0.1, 0.7, 1e-6))
     >>> measurements = (S + rho * code[21, :, np.newaxis] / 255).astype(np.float32)[np.newaxis]
     >>> patterns = Patterns(pyramid, 1, code)
-    >>> found = recover(measurements, Photometry(S, rho, variance, variance), patterns, Noise(1e-6, 0))
+    >>> found = recover(measurements, Photometry(S, rho, variance, variance), patterns, NoiseModel(1e-6, 0))
     >>> light = np.zeros((pyramid.nodes, 3), np.float32)
     >>> light[21] = 1
     >>> print(found.transport.apply(light).round(2))

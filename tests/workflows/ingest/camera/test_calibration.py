@@ -11,7 +11,7 @@ from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import MOST_APART, measure
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 
 PROGRAM = preset("sketch", 320, 240)
 LOOK_UP = table("srgb", np.dtype(np.uint16))
@@ -74,7 +74,7 @@ class Film:
 
 def deviation(film: Film) -> float:
     """Of the noise of a middling value."""
-    return float(np.sqrt(Noise(**film.attributes["noise"]).variance(np.array([0.25]))[0]))
+    return float(np.sqrt(NoiseModel(**film.attributes["noise"]).variance(np.array([0.25]))[0]))
 
 
 @pytest.mark.parametrize("free", [False, True])

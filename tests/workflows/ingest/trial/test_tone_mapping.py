@@ -18,10 +18,10 @@ from workflows.ingest.report.report import report
 from workflows.ingest.trial import tone_mapping
 from workflows.ingest.trial.border_tone_mapping import Power
 from workflows.ingest.trial.tone_mapping import LEAST, find_tone_mapping
-from workflows.ingest.trial.trial_recovery import Sample
+from workflows.ingest.trial.trial_recovery import PixelSample
 from workflows.ingest.trial.unexplained import Rest
 from workflows.programs.program import Program
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene
 
@@ -57,7 +57,7 @@ def filmed(scene: Scene, program: Program, power: float = 0.0, sharpening: float
 
 def left_by(
     power: float, pixels: int = 400, frames: int = 40, *, mixed: float = 0.0, smeared: float = 0.0
-) -> tuple[Stack, Rest, Sample]:
+) -> tuple[Stack, Rest, PixelSample]:
     """Residuals of pixels that see patterns as all black or all white, by a camera that maps tones.
 
     Where it is ``mixed``, patterns in colour are brighter in bright surroundings, and a channel sees so much of the
@@ -95,10 +95,10 @@ def left_by(
         plain=plain,
         rho=np.full(plain.shape, 0.6),
         rest=(seen + NOISE * rng.standard_normal(plain.shape)) * 2 / 0.6,
-        noise=Noise(NOISE**2, 0.0),
+        noise=NoiseModel(NOISE**2, 0.0),
     )
     sample = SimpleNamespace(places=(y, x), chosen=(np.arange(pixels) // 10,))
-    return cast(Stack, stack), cast(Rest, rest), cast(Sample, sample)
+    return cast(Stack, stack), cast(Rest, rest), cast(PixelSample, sample)
 
 
 def test_power_is_that_of_the_residuals() -> None:

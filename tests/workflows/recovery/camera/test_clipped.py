@@ -3,10 +3,10 @@
 import numpy as np
 
 from workflows.recovery.camera.clipped import DEVIATION, NARROWEST, bound_clipped
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 
-NOISE = Noise(1e-6, 0)
+NOISE = NoiseModel(1e-6, 0)
 S, RHO = 0.1, 0.8
 
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.camera.noise import Noise, estimate_excess, fit_noise
+from workflows.recovery.camera.noise import NoiseModel, estimate_excess, fit_noise
 
 
 @pytest.mark.parametrize("trim", [0.9, 1.0])
 def test_line_fits_the_samples(trim):
     rng = np.random.default_rng(0)
     level = rng.uniform(0, 1, 100_000)
-    noise = Noise(4e-6, 5e-5)
+    noise = NoiseModel(4e-6, 5e-5)
     found = fit_noise(level, noise.variance(level) * rng.standard_normal(level.size) ** 2, 1e-12, trim=trim)
     assert found.read == pytest.approx(noise.read, rel=0.15)
     assert found.shot == pytest.approx(noise.shot, rel=0.05)
@@ -20,7 +20,7 @@ def test_line_fits_the_samples(trim):
 def test_line_fits_however_few_of_the_values_are_dark(dark):
     rng = np.random.default_rng(0)
     level = np.concatenate([rng.uniform(0.005, 0.015, dark), rng.uniform(0.8, 0.95, 30_000)])
-    noise = Noise(6e-6, 6e-5)
+    noise = NoiseModel(6e-6, 6e-5)
     found = fit_noise(level, noise.variance(level) * rng.standard_normal(level.size) ** 2, 1e-12)
     assert found.read == pytest.approx(noise.read, rel=0.15)
 

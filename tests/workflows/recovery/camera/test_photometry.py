@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import estimate_crosstalk, estimate_noise, fit_photometry
 
-NOISE = Noise(4e-6, 5e-5)
+NOISE = NoiseModel(4e-6, 5e-5)
 
 
 def constants(n, k=8, noise=NOISE, seed=0, frames=1):
@@ -71,7 +71,7 @@ def test_all_levels_serve_where_fewer_than_two_usable_ones_differ():
 def test_a_dead_channel_has_rho_zero_and_the_mean_as_s():
     values, levels, _, _ = constants(1)
     values[0, :, 2] = np.linspace(0.04, 0.02, 8)
-    fit = fit_photometry(values, levels, np.ones(values.shape, bool), Noise(1e-6, 0), np.ones(8, int))
+    fit = fit_photometry(values, levels, np.ones(values.shape, bool), NoiseModel(1e-6, 0), np.ones(8, int))
     assert fit.rho[0, 2] == 0
     assert fit.S[0, 2] == pytest.approx(0.03)
 
@@ -106,7 +106,7 @@ def test_noise_is_recovered():
 
 
 def test_noise_is_not_hidden_by_a_black_that_is_clipped():
-    true, step = Noise(5e-6, 6e-5), 1 / 255
+    true, step = NoiseModel(5e-6, 6e-5), 1 / 255
     random = np.random.default_rng(0)
     levels = np.repeat(np.array([0.0, 1.0], np.float32), 4)[:, np.newaxis] * np.ones(3, np.float32)
     black = np.where(np.arange(4000) % 4 == 0, 4, 1)[:, np.newaxis, np.newaxis] * step  # most are near 0
@@ -134,7 +134,7 @@ def test_noise_of_few_levels_is_that_of_a_typical_sensor():
 
 
 def test_noise_is_never_below_the_quantisation():
-    values, levels, _, _ = constants(500, noise=Noise(0, 0))
+    values, levels, _, _ = constants(500, noise=NoiseModel(0, 0))
     found = estimate_noise(values, levels, np.ones(values.shape, bool), 1 / 255)
     assert found.read >= (1 / 255) ** 2 / 12
     assert found.variance(np.zeros(1)).dtype == np.float32

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workflows.recovery.camera.noise import Noise
+from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry, fit_photometry
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.lobes.options import FINE, LobesOptions
@@ -193,7 +193,7 @@ def test_disagreement_decides_whether_channels_share_t(patterns, varied, observe
 
 
 def test_patterns_improve_s_and_rho(patterns, truth, observe):
-    n, rng, noise = 40, np.random.default_rng(0), Noise(4e-6, 5e-5)
+    n, rng, noise = 40, np.random.default_rng(0), NoiseModel(4e-6, 5e-5)
     T = np.repeat(truth((25.3, 18.6, 3.0, 1.5, 0.6)), n, axis=0)
     measurements, exact, _ = observe(patterns, T)
     levels = np.repeat(np.linspace(0, 1, 4)[:, None], 3, axis=1).astype(np.float32)

@@ -50,7 +50,7 @@ def test_malformed_problem_becomes_an_error(body: bytes) -> None:
 
 
 def test_computed_answers_are_waited_for_longer_than_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.client._transport.SILENCE", 0.2)
+    monkeypatch.setattr("services.client._session.SILENCE", 0.2)
     given_up = threading.Event()
 
     class Slow(BaseHTTPRequestHandler):

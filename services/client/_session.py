@@ -29,7 +29,7 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
 """Seconds between two attempts; the pause doubles with each."""
 
 
-class Transport:
+class Session:
     """A connection to a service.
 
     Parameters
