@@ -1,6 +1,8 @@
-"""Commands that use kernels, where this user can write to no folder for them."""
+"""Commands that run processes: their help, a port that is taken, no folder for kernels."""
 
 import os
+import re
+import socket
 from pathlib import Path
 
 import pytest
@@ -8,6 +10,45 @@ from click.testing import CliRunner
 
 from services.cli.main import main
 from services.runtime.kernel_cache import require_kernel_cache
+from services.settings import (
+    ClusterSettings,
+    CoordinatorSettings,
+    SchedulerSettings,
+    Settings,
+    describe_settings,
+)
+from tests.services.cli.commands import envmatte
+
+
+@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize(
+    ("command", "model"),
+    [
+        ("serve", Settings),
+        ("coordinator", CoordinatorSettings),
+        ("scheduler", SchedulerSettings),
+        ("worker", ClusterSettings),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_help_of_a_process_lists_its_settings(
+    command: str, model: type[SchedulerSettings], width: int
+) -> None:
+    text = CliRunner().invoke(main, [command, "--help"], terminal_width=width).output
+    assert max(map(len, text.splitlines())) <= width
+    words = " ".join(text.split())
+    described = describe_settings(model)
+    assert set(re.findall(r"\bENVMATTE_\w+", text)) == {one.variable for one in described}
+    for one in described:
+        assert f"{one.variable} {one.description} [default: {one.default}]" in words
+
+
+def test_exit_code_4_and_no_data_folder_if_the_port_is_taken(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        data, port = tmp_path / "data", taken.getsockname()[1]
+        found = envmatte("serve", "--data", str(data), "--port", str(port))
+    assert (found.returncode, found.stdout, data.exists()) == (4, "", False)
+    assert "choose another port with --port" in found.stderr
 
 
 @pytest.mark.parametrize("command", ["serve", "coordinator", "worker", "warm"])
