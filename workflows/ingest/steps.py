@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,14 @@ from workflows.ingest import films, stills
 from workflows.ingest.archive import CaptureArchive
 from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import measure
-from workflows.ingest.manifest import MANIFEST
+from workflows.ingest.manifest import MANIFEST, Manifest, Video
 from workflows.ingest.report.survey import survey
 from workflows.ingest.trial.qualities import try_qualities
 from workflows.ingest.trial.steadiness import find_steadiness
 from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.frame_means import Share
-from workflows.ingest.video.matching import MAX_MATCHED, MatchedFrames, match_frames
+from workflows.ingest.video.matching import MAX_MATCHED, match_frames
 from workflows.ingest.video.resemblance import lay_out
 from workflows.jobs import Steps, Task
 from workflows.programs.program import Images
@@ -53,43 +53,19 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         archive = CaptureArchive(file, limits)
         manifest = archive.manifest
         patterns = _decode_patterns(decoder, archive, limits)
-        # One orientation for all frames: a camera that looks down detects its orientation at random.
-        turn, half_colour = 1, False
-        if manifest.video is None:
-            header = stills.header(decoder, archive, manifest.frames[0].file)
-            turn, half_colour = header.orientation, header.half_colour
-        shape, storage, filmed = _examine(decoder, archive, patterns, limits)
-        mask = None
-        if manifest.mask is not None:
-            mask = np.any(stills.read_integers(decoder, archive, manifest.mask), axis=2)
-            if mask.shape != shape[1:3]:
-                raise CaptureError(
-                    f"{manifest.mask} is {_size(mask)}, the frames are {shape[2]} x {shape[1]}"
-                    + (", turned upright as the first of them says" if turn > 1 else ""),
-                    entry=manifest.mask,
-                )
-            if not mask.any():
-                raise CaptureError(
-                    f"{manifest.mask} is black everywhere: paint white what is to be recovered; transparency is not "
-                    "read",
-                    entry=manifest.mask,
-                )
-    frames, height, width, _ = shape
-    shown = manifest.frames[0].file if manifest.video is None else manifest.video.file
-    limits.check_pixels(width, height, entry=shown)
-    taken = math.prod(shape) * storage.dtype.itemsize
-    if taken > limits.unpacked:
-        raise CaptureError(
-            f"{frames} frames of {width} x {height} pixels take {taken} bytes, more than the "
-            f"{limits.unpacked} allowed: use fewer or smaller ones",
-            entry=MANIFEST,
-            field="frames" if filmed is None else "video",
-            limit=limits.unpacked,
+        found = (
+            _examine_stills(decoder, archive)
+            if manifest.video is None
+            else _examine_film(decoder, archive, manifest.video, patterns, limits)
         )
+        mask = None if manifest.mask is None else _decode_mask(decoder, archive, manifest.mask, found)
+    _check_size(manifest, found, limits)
+    frames, height, width, _ = found.shape
+    storage = found.storage
     slab = create_stack(
         objects,
         task.capture,
-        shape,
+        found.shape,
         storage.dtype,
         memory=limits.memory,
         attributes={
@@ -99,24 +75,15 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
             if storage.black
             else TypeAdapter(Response).dump_python(manifest.response, mode="json"),
             "storage": {"black": storage.black, "full": storage.full, "bounded": storage.bounded},
-            "patterns": [frame.pattern for frame in manifest.frames]
-            if filmed is None
-            else list(filmed.shares),
-            "exposures": [frame.exposure for frame in manifest.frames] or [1.0] * frames,
-            **(
-                {"orientation": turn, "half_colour": half_colour}
-                if filmed is None
-                else {"video": filmed.record}
-            ),
+            **found.attributes,
             "border": manifest.video is not None and manifest.video.border is not None,
         },
         mask=mask,
         images=patterns,
-        shares=None if filmed is None else filmed.table,
+        shares=found.shares,
     )
-    notes = [] if filmed is None else filmed.notes
-    size = {"width": width, "height": height, "frames": frames, "video": filmed is not None}
-    return {"tiles": -(-frames // slab), "slab": slab, "memory": limits.memory, **size, "notes": notes}
+    size = {"width": width, "height": height, "frames": frames, "video": manifest.video is not None}
+    return {"tiles": -(-frames // slab), "slab": slab, "memory": limits.memory, **size, "notes": found.notes}
 
 
 def _decode_patterns(decoder: Decoder, archive: CaptureArchive, limits: Limits) -> list[NDArray[np.float32]]:
@@ -146,18 +113,56 @@ def _too_large(name: str, limit: int) -> CaptureError:
     )
 
 
-def _examine(
-    decoder: Decoder, archive: CaptureArchive, patterns: Sequence[NDArray[np.float32]], limits: Limits
-) -> tuple[tuple[int, int, int, int], stills.Storage, MatchedFrames | None]:
-    """The shape of the stack and how it is stored; for a video, also its frames matched to the patterns."""
-    manifest = archive.manifest
-    if manifest.video is None:
-        first = stills.read(decoder, archive, manifest.frames[0].file)
-        height, width, channels = first.shape
-        shape = len(manifest.frames), height, width, channels
-        return shape, stills.storage_of(decoder, archive, first), None
-    program, video = manifest.program, manifest.video
-    entry = video.file
+class _Frames(NamedTuple):
+    """The frames of a capture as its stack will hold them.
+
+    Attributes
+    ----------
+    shape : (int, int, int, int)
+        Of the stack: frames, height, width and channels.
+    storage : Storage
+    attributes : dict
+        Of the stack: which pattern each frame shows, its exposure, and how it was taken.
+    shares : (k, 3) int64 or None
+        As of `create_stack`; None for stills.
+    notes : list of str
+        Lines for the job's log.
+    """
+
+    shape: tuple[int, int, int, int]
+    storage: stills.Storage
+    attributes: dict[str, Any]
+    shares: NDArray[np.int64] | None
+    notes: list[str]
+
+
+def _examine_stills(decoder: Decoder, archive: CaptureArchive) -> _Frames:
+    """The frames that are stills, by the first of them."""
+    frames = archive.manifest.frames
+    header = stills.header(decoder, archive, frames[0].file)
+    first = stills.read(decoder, archive, frames[0].file)
+    height, width, channels = first.shape
+    attributes = {
+        "patterns": [frame.pattern for frame in frames],
+        "exposures": [frame.exposure for frame in frames],
+        # One orientation for all frames: a camera that looks down detects its orientation at random.
+        "orientation": header.orientation,
+        "half_colour": header.half_colour,
+    }
+    storage = stills.storage_of(decoder, archive, first)
+    return _Frames((len(frames), height, width, channels), storage, attributes, None, [])
+
+
+def _examine_film(
+    decoder: Decoder,
+    archive: CaptureArchive,
+    video: Video,
+    patterns: Sequence[NDArray[np.float32]],
+    limits: Limits,
+) -> _Frames:
+    """The frames of a film, matched to the patterns."""
+    manifest, entry = archive.manifest, video.file
+    program = manifest.program
     if program.count > MAX_MATCHED:
         raise CaptureError(
             f"{entry} shows {program.count} patterns, more than the {MAX_MATCHED} that are found in a video: "
@@ -174,8 +179,48 @@ def _examine(
     filmed = match_frames(
         signatures, ticks, tick, program, light, large, video, unfinished=manifest.unfinished
     )
-    shape = len(filmed.shares), film.height, film.width, 3
-    return shape, stills.Storage(np.dtype(np.uint16), 0, 1.0, True), filmed
+    frames = len(filmed.shares)
+    attributes = {"patterns": list(filmed.shares), "exposures": [1.0] * frames, "video": filmed.record}
+    storage = stills.Storage(np.dtype(np.uint16), 0, 1.0, True)
+    return _Frames((frames, film.height, film.width, 3), storage, attributes, filmed.table, filmed.notes)
+
+
+def _decode_mask(decoder: Decoder, archive: CaptureArchive, entry: str, found: _Frames) -> NDArray[np.bool_]:
+    """The pixels that are to be recovered, (height, width)."""
+    mask = np.any(stills.read_integers(decoder, archive, entry), axis=2)
+    _, height, width, _ = found.shape
+    if mask.shape != (height, width):
+        raise CaptureError(
+            f"{entry} is {_size(mask)}, the frames are {width} x {height}"
+            + (
+                ", turned upright as the first of them says"
+                if found.attributes.get("orientation", 1) > 1
+                else ""
+            ),
+            entry=entry,
+        )
+    if not mask.any():
+        raise CaptureError(
+            f"{entry} is black everywhere: paint white what is to be recovered; transparency is not read",
+            entry=entry,
+        )
+    return np.asarray(mask)
+
+
+def _check_size(manifest: Manifest, found: _Frames, limits: Limits) -> None:
+    """Check that the stack may be as large as it will be."""
+    frames, height, width, _ = found.shape
+    entry = manifest.frames[0].file if manifest.video is None else manifest.video.file
+    limits.check_pixels(width, height, entry=entry)
+    taken = math.prod(found.shape) * found.storage.dtype.itemsize
+    if taken > limits.unpacked:
+        raise CaptureError(
+            f"{frames} frames of {width} x {height} pixels take {taken} bytes, more than the "
+            f"{limits.unpacked} allowed: use fewer or smaller ones",
+            entry=MANIFEST,
+            field="frames" if manifest.video is None else "video",
+            limit=limits.unpacked,
+        )
 
 
 def work(objects: Objects, task: Task, tile: int) -> int:
