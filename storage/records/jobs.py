@@ -120,8 +120,12 @@ def is_retryable(problem: dict[str, Any]) -> bool:
 
 
 def cancelled_with_leftovers(connection: Connection) -> Sequence[Row[Any]]:
-    """Cancelled jobs whose unfinished capture, matte or composite is still to be removed."""
-    return connection.execute(select(jobs).where(jobs.c.state == "cancelled", jobs.c.leftovers)).all()
+    """Cancelled jobs whose unfinished capture, matte or composite is still to be removed.
+
+    Only what says where that is: they may be many, and their plans large.
+    """
+    query = select(*(jobs.c[name] for name in ("id", "kind", "capture", "matte")))
+    return connection.execute(query.where(jobs.c.state == "cancelled", jobs.c.leftovers)).all()
 
 
 def change(connection: Connection, job: str, **values: Any) -> None:

@@ -175,7 +175,8 @@ def test_only_cancelled_job_has_leftovers(connection: Connection) -> None:
     jobs.end(connection, other, "succeeded")
     assert jobs.cancelled_with_leftovers(connection) == []
     jobs.cancel(connection, job)
-    assert [row.id for row in jobs.cancelled_with_leftovers(connection)] == [job]
+    (row,) = jobs.cancelled_with_leftovers(connection)
+    assert row._asdict() == {"id": job, "kind": "composite", "capture": "cap", "matte": "other"}
     jobs.change(connection, job, leftovers=False)
     jobs.cancel(connection, job)  # again
     assert jobs.cancelled_with_leftovers(connection) == []
