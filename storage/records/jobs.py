@@ -27,6 +27,7 @@ def add(
     capture: str,
     options: dict[str, Any],
     matte: str | None = None,
+    *,
     trace: str | None = None,
     job: str | None = None,
     stored: int | None = None,

@@ -194,7 +194,7 @@ class Served:
         matte = make_matte(objects)
         with writing(engine) as c:
             mattes.add_imported(c, "m", matte.attributes["options"], matte.figures, 1000, None)
-            jobs.add(c, "composite", "", {}, "m", None, "v", 1000)
+            jobs.add(c, "composite", "", {}, "m", job="v", stored=1000)
             tiles.add_steps(c, "v")
             jobs.log(c, "v", "a line")
             jobs.end(c, "v", "succeeded")

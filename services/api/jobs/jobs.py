@@ -269,7 +269,7 @@ def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
             capture.id,
             chosen,
             matte,
-            tracing.current_traceparent(),
+            trace=tracing.current_traceparent(),
             webhook=request.webhook,
             region=request.region.stored if request.region else None,
         )

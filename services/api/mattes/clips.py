@@ -148,8 +148,17 @@ def _queue(
         row = mattes.get_ready(c, matte)
         bodies.release(c, job)
         admit(c, context.settings, jobs=1, size=size)
-        capture, trace = row.capture or "", tracing.current_traceparent()
-        jobs.add(c, "composite", capture, options, matte, trace, job, size, webhook)
+        jobs.add(
+            c,
+            "composite",
+            row.capture or "",
+            options,
+            matte,
+            trace=tracing.current_traceparent(),
+            job=job,
+            stored=size,
+            webhook=webhook,
+        )
         return job
 
     return idempotent(context.engine, key, _call(matte), Job.read, create, job)

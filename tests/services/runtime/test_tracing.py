@@ -108,7 +108,7 @@ def test_a_retried_job_continues_in_the_trace_of_the_retry(tmp_path: Path) -> No
     again = CALLER.replace("0123", "4567")
     with writing(engine) as c:
         mattes.add_imported(c, "m", {}, {})
-        job = jobs.add(c, "composite", "", {}, "m", CALLER)
+        job = jobs.add(c, "composite", "", {}, "m", trace=CALLER)
     for sent in (again, None):  # a retry without a trace keeps the one before
         with writing(engine) as c:
             jobs.end(c, job, "failed", {"detail": "", "status": 500})

@@ -99,7 +99,7 @@ def test_transaction_whose_connection_breaks_creates_once(
     monkeypatch.setattr(idempotency, "PAUSE", 0)
 
     def create(connection: Connection) -> str:
-        return jobs.add(connection, "recover", "cap", {}, "mat", None, "job")
+        return jobs.add(connection, "recover", "cap", {}, "mat", job="job")
 
     assert idempotent(engine, None, CALL, jobs.get, create, "job").id == "job"
     assert (breaks, count(engine)) == ([], 1)
