@@ -1,14 +1,19 @@
 """What the API says about jobs, from the rows of a database."""
 
 import time
+from pathlib import Path
 from typing import Any
 
+from fastapi.testclient import TestClient
 from sqlalchemy import Engine, event
 
+from services.api.app import build_app
 from services.api.jobs.jobs import Job
+from services.settings import Settings
 from storage.database.engine import reading, writing
 from storage.database.rows import page
 from storage.database.tables import jobs as table
+from storage.objects.store import Objects
 from storage.records import captures, jobs, leases, tiles
 
 
@@ -67,3 +72,13 @@ def test_page_of_jobs_takes_as_many_queries_as_a_job_of_each_kind(engine: Engine
         add(number)
     found, many = read()
     assert (len(found), many) == (18, few)
+
+
+def test_a_job_that_a_newer_service_queued_is_shown(tmp_path: Path, engine: Engine, objects: Objects) -> None:
+    with writing(engine) as c:
+        job = jobs.add(c, "newer", "c", {})
+    client = TestClient(build_app(Settings(data=tmp_path), engine, objects), "http://localhost")
+    assert [found["kind"] for found in client.get("/v1/jobs").json()["jobs"]] == ["newer"]
+    region = {"region": {"x": 0, "y": 0, "width": 1, "height": 1}}
+    refused = client.patch(f"/v1/jobs/{job}", json=region)
+    assert (refused.status_code, "is no recovery" in refused.json()["detail"]) == (422, True)
