@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from storage.errors import Conflict
+from workflows.composite.strips import Rows
 from workflows.interruption import checkpoint
 from workflows.mattes.perspective import Places, find_perspective, in_frame, sights
 from workflows.recovery.pyramid import Grids
@@ -121,7 +122,7 @@ def _through(place: NDArray[np.floating], away: float) -> Rays:
 
 @njit(nogil=True, cache=True)
 def arrived_along(
-    rows_of_strip: tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint16], NDArray[np.uint16]],
+    rows_of_strip: Rows,
     shared: NDArray[np.bool_],
     light: NDArray[np.float32],
     grids: Grids,
@@ -133,8 +134,7 @@ def arrived_along(
 
     Parameters
     ----------
-    rows_of_strip : tuple
-        Its `count`, `first`, `step` and `code`.
+    rows_of_strip : Rows
     shared : (h, w) bool
         The strip's.
     light : (nodes + 1, 3) float32

@@ -12,7 +12,7 @@ from storage.errors import OptionError
 from storage.layout.mattes import Matte
 from workflows.composite.depth import Rays, arrived_along
 from workflows.composite.gather import gather
-from workflows.composite.strips import LENGTH, Strip
+from workflows.composite.strips import LENGTH, Rows, Strip
 from workflows.images.resample import area_mean
 from workflows.interruption import checkpoint
 from workflows.recovery.pyramid import Grids, Pyramid
@@ -130,14 +130,11 @@ def compose(
             to[:] = seen[max(-top, 0) :, max(-left, 0) :][: to.shape[0], : to.shape[1]]
             return
         _compose(
+            strip.rows,
             strip.S,
             strip.rho,
             strip.recovered,
             strip.shared,
-            strip.count,
-            strip.first,
-            strip.step,
-            strip.code,
             light,
             crosstalk,
             top,
@@ -159,22 +156,18 @@ def _seen_along(
 ) -> NDArray[np.float32]:
     """Composite a strip over a backdrop at another depth."""
     arrived = np.empty_like(strip.S)
-    rows = strip.count, strip.first, strip.step, strip.code
-    arrived_along(rows, strip.shared, light, grids, shift, scale, arrived)
+    arrived_along(strip.rows, strip.shared, light, grids, shift, scale, arrived)
     alpha = strip.recovered[..., np.newaxis]
     return np.concatenate([alpha * (strip.S + (strip.rho * arrived) @ crosstalk.T), alpha], axis=2)
 
 
 @njit(nogil=True, cache=True, fastmath={"contract"})
 def _compose(
+    rows: Rows,
     S: NDArray[np.float32],
     rho: NDArray[np.float32],
     recovered: NDArray[np.bool_],
     shared: NDArray[np.bool_],
-    count: NDArray[np.uint32],
-    first: NDArray[np.uint32],
-    step: NDArray[np.uint16],
-    code: NDArray[np.uint16],
     light: NDArray[np.float32],
     crosstalk: NDArray[np.float32],
     top: int,
@@ -183,6 +176,7 @@ def _compose(
 ) -> None:
     """Composite the part of a strip that lies in the picture; its first pixel is at (top, left)."""
     height, width, _ = picture.shape
+    count, first, step, code = rows
     row, entry, none = np.intp(0), np.intp(0), np.float32(0)
     for y in range(recovered.shape[0]):
         for x in range(recovered.shape[1]):

@@ -23,6 +23,8 @@ MOST = 65535
 """The largest distance of two cells, and the code of a row's largest weight."""
 Blocks = Set[tuple[int, int]]
 """Pairs of block row and block column."""
+Rows = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint16], NDArray[np.uint16]]
+"""The rows T of a strip: its `count`, `first`, `step` and `code`."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,11 @@ class Strip:
     first: NDArray[np.uint32]
     step: NDArray[np.uint16]
     code: NDArray[np.uint16]
+
+    @property
+    def rows(self) -> Rows:
+        """The rows T, for kernels."""
+        return self.count, self.first, self.step, self.code
 
     @property
     def nbytes(self) -> int:
