@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
 from services.api.context import Context
-from services.api.http.bodies import read_json, schema_of
+from services.api.http.bodies import json_body, read_json
 from storage.database.engine import reading, writing
 from workflows.untrusted.validation import Name
 
@@ -22,7 +22,7 @@ class Change(BaseModel):
     name: Name = Field(min_length=1, description="A name for people.")
 
 
-CHANGE: dict[str, Any] = {"requestBody": {"content": {"application/json": {"schema": schema_of(Change)}}}}
+CHANGE = json_body(Change)
 """For the ``openapi_extra`` of a route."""
 
 

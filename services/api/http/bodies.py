@@ -11,6 +11,7 @@ from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
+from services.api.http.media_types import JSON
 from services.runtime.problems import TooLarge
 from services.settings import Settings
 from storage.disks import require_reserve
@@ -169,6 +170,11 @@ async def read_json(request: Request, model: type[Model], limit: int) -> Model:
     except ValidationError as error:
         found = [detail | {"loc": ("body", *detail["loc"])} for detail in error.errors(include_url=False)]
         raise RequestValidationError(found) from error
+
+
+def json_body(model: type[BaseModel]) -> dict[str, Any]:
+    """The ``openapi_extra`` of a route that reads a JSON body itself."""
+    return {"requestBody": {"content": {JSON: {"schema": schema_of(model)}}}}
 
 
 def schema_of(model: type[BaseModel]) -> dict[str, Any]:

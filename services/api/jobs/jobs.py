@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Row
 
 from services.api.context import Context, OwnerContext
-from services.api.http.bodies import read_json, schema_of
+from services.api.http.bodies import json_body, read_json
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.responses import json_response, utc_time
 from services.api.http.router import Router, in_turn
@@ -227,7 +227,7 @@ def list_options(context: OwnerContext) -> Options:
 @router.post(
     "/jobs",
     status_code=202,
-    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(JobRequest)}}}},
+    openapi_extra=json_body(JobRequest),
 )
 async def post_job(
     context: OwnerContext,
@@ -324,7 +324,7 @@ async def _job_change(request: Request) -> JobChange:
 @router.patch(
     "/jobs/{id}",
     dependencies=[Depends(in_turn(get_job))],  # an unknown job is reported before a bad body
-    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(JobChange)}}}},
+    openapi_extra=json_body(JobChange),
 )
 def change_job(context: OwnerContext, id: str, change: Annotated[JobChange, Depends(_job_change)]) -> Job:
     """Pause a job or continue it, or recover a part of the frame first."""

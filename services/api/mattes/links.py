@@ -12,7 +12,7 @@ from sqlalchemy import Row
 
 from services.api.auth import Caller
 from services.api.context import OwnerContext, PublicContext
-from services.api.http.bodies import has_body, read_json, schema_of
+from services.api.http.bodies import has_body, json_body, read_json
 from services.api.http.media_types import preferred
 from services.api.http.router import Router
 from services.api.mattes.live import live_page
@@ -78,7 +78,7 @@ async def _link_request(request: Request) -> LinkRequest:
 @router.post(
     "/mattes/{id}/links",
     status_code=201,
-    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(LinkRequest)}}}},
+    openapi_extra=json_body(LinkRequest),
 )
 def create_link(
     context: OwnerContext, id: str, given: Annotated[LinkRequest, Depends(_link_request)]

@@ -8,7 +8,7 @@ from fastapi import Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 
 from services.api.context import OwnerContext
-from services.api.http.bodies import read_json, schema_of
+from services.api.http.bodies import json_body, read_json
 from services.api.http.router import Router, in_turn
 from services.api.jobs.events import MEDIA_TYPE, stream
 from services.api.programs.programs import PlaybackState, Program, get_program
@@ -27,7 +27,7 @@ async def _state(request: Request) -> PlaybackState:
     "/programs/{id}/showing",
     status_code=204,
     dependencies=[Depends(in_turn(get_program))],  # an unknown program is reported before a bad body
-    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(PlaybackState)}}}},
+    openapi_extra=json_body(PlaybackState),
 )
 def put_showing(context: OwnerContext, id: str, state: Annotated[PlaybackState, Depends(_state)]) -> None:
     """Report how far the playback of a program is: its page does so, for clients that follow it."""

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sqlalchemy import Row
 
 from services.api.context import OwnerContext
-from services.api.http.bodies import read_json, schema_of
+from services.api.http.bodies import json_body, read_json
 from services.api.http.responses import json_response
 from services.api.http.router import Router
 from services.api.http.types import After, PageSize
@@ -173,7 +173,7 @@ def list_presets(context: OwnerContext) -> Presets:
 @router.post(
     "/programs",
     status_code=201,
-    openapi_extra={"requestBody": {"content": {"application/json": {"schema": schema_of(ProgramRequest)}}}},
+    openapi_extra=json_body(ProgramRequest),
 )
 def post_program(
     context: OwnerContext, request: Annotated[ProgramRequest, Depends(_request)], response: Response
