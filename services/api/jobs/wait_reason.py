@@ -51,5 +51,5 @@ def reason(row: Row[Any], situation: Situation) -> str | None:
         return f"no progress in the last {still:.0f} s: a tile takes long, or its worker does not answer"
     if others := situation.running - 1:
         workers = len(sign.cluster["workers"]) if sign else 0
-        return f"it shares {workers} workers with {others} other jobs"
+        return f"it shares the workers, {workers} in all, with other jobs: {others}"
     return None

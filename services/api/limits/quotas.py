@@ -160,8 +160,8 @@ def _admit_owner(connection: Connection, settings: Settings, captures: int, jobs
         value = statistics.captures_and_uploads(connection) + captures
         if value > settings.owner_captures:
             raise NoRoom(
-                f"you may have {settings.owner_captures} captures, unfinished uploads included, and this would be the "
-                f"{value}th; delete some first",
+                f"you may have {settings.owner_captures} captures, unfinished uploads included, and this would be "
+                f"number {value}; delete some first",
                 name="owner_captures",
                 limit=settings.owner_captures,
                 value=value,
@@ -170,8 +170,8 @@ def _admit_owner(connection: Connection, settings: Settings, captures: int, jobs
         value = statistics.active_jobs(connection) + jobs
         if value > settings.owner_jobs:
             raise TooMany(
-                f"you may have {settings.owner_jobs} queued or running jobs, ingests included, and this would be the "
-                f"{value}th; wait for one to end, or cancel one",
+                f"you may have {settings.owner_jobs} queued or running jobs, ingests included, and this would be "
+                f"number {value}; wait for one to end, or cancel one",
                 name="owner_jobs",
                 limit=settings.owner_jobs,
                 value=value,

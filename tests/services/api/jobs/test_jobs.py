@@ -64,9 +64,9 @@ def test_page_of_jobs_takes_as_many_queries_as_a_job_of_each_kind(engine: Engine
     add(0)
     one_each, few = read()
     assert [job.waits_for for job in one_each] == [
-        "it shares 2 workers with 1 other jobs",
+        "it shares the workers, 2 in all, with other jobs: 1",
         "its capture new-0 is being ingested",
-        "it shares 2 workers with 1 other jobs",
+        "it shares the workers, 2 in all, with other jobs: 1",
     ]
     for number in range(1, 6):
         add(number)

@@ -129,7 +129,7 @@ def test_captures_of_an_owner(serve: Serve, archive: bytes, tmp_path: Path) -> N
     assert create(client, 10).status_code == 201
     before = files(tmp_path)
     detail = refused(create(client, 10), 507, "owner_captures", 2, 3)["detail"]
-    assert "delete some first" in detail
+    assert "this would be number 3; delete some first" in detail
     refused(client.post("/v1/captures", content=archive, headers=ZIP), 507, "owner_captures", 2, 3)
     assert files(tmp_path) == before
     assert bob.post("/v1/captures", content=archive, headers=ZIP).status_code == 201
