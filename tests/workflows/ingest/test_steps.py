@@ -1,7 +1,6 @@
 """Ingest: a capture's files into its stack, value for value, within its memory, and what it refuses."""
 
 import io
-import json
 import random
 import sys
 import zipfile
@@ -19,15 +18,11 @@ from storage.errors import CaptureError, Corrupt, OverLimit
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from tests.parts import peak
-from tests.parts.captures import nested_program
 from tests.workflows.ingest.video.camera import Camera, Film, capture, film
 from tests.workflows.ingest.video.films import CAMERA, PROGRAM, IngestFilm, program_with
 from workflows.images.integer_formats import encode_png
 from workflows.ingest import steps, stills
 from workflows.jobs import Task
-from workflows.recovery.camera.noise import NoiseModel
-from workflows.simulation.glass_ball import glass_ball
-from workflows.simulation.scene import write_capture
 from workflows.untrusted.limits import Limits
 
 Zip = Callable[..., bytes]
@@ -231,59 +226,6 @@ def test_a_frame_larger_than_a_quarter_of_the_memory_is_refused(
     with pytest.raises(CaptureError, match="100 x 100 pixels") as caught:
         ingest("c", data, memory=4 * (size - 1))
     assert caught.value.fields == {"entry": "0.png", "limit": size - 1}
-
-
-@pytest.mark.parametrize(
-    ("camera", "monitor", "found"),
-    [
-        ("unknown", "linear", {"camera_curve": 2.2, "monitor_curve": "linear"}),
-        ("linear", "unknown", {"camera_curve": "linear", "monitor_curve": 2.2}),
-        ("unknown", "unknown", {"camera_curve": "srgb", "monitor_curve": "srgb"}),
-    ],
-)
-def test_an_unknown_response_is_estimated(
-    ingest: Ingest, camera: str, monitor: str, found: dict[str, Any]
-) -> None:
-    scene = glass_ball(40, 30, monitor=(64, 48), rays=4)
-    program = nested_program((64, 48), bands=((4, 3, 4),), levels=8)
-    if monitor == "unknown":
-        # Levels that a gamma of 2.2 turns into those that were filmed.
-        levels = tuple((np.linspace(0, 1, 8) ** (1 / 2.2)).tolist())
-    else:
-        levels = tuple(np.linspace(0, 1, 8).tolist())
-    target = io.BytesIO()
-    write_capture(scene, program, target, noise=0.5, depth=16)
-    changed = io.BytesIO()
-    with zipfile.ZipFile(target) as archive, zipfile.ZipFile(changed, "w") as out:
-        for name in archive.namelist():
-            data = archive.read(name)
-            if name == "capture.json":
-                given = json.loads(data)
-                given["response"] = camera
-                given["program"]["monitor"]["response"] = monitor
-                given["program"]["parts"][0]["levels"] = levels
-                data = json.dumps(given).encode()
-            elif camera == "unknown":
-                value = steps.integer_formats.decode(data, memory=1 << 24) / 65535
-                data = encode_png(np.rint(value ** (1 / 2.2) * 65535).astype(np.uint16))
-            out.writestr(name, data)
-    attributes = ingest("c", changed.getvalue()).attributes
-    for name, curve in found.items():
-        if isinstance(curve, float):
-            assert attributes[name]["gamma"] == pytest.approx(curve, abs=0.1)
-        else:
-            assert attributes[name] == curve
-
-
-def test_measured_noise_is_that_of_the_camera(ingest: Ingest) -> None:
-    scene = glass_ball(80, 60, monitor=(64, 48), rays=4)
-    target = io.BytesIO()
-    write_capture(scene, nested_program((64, 48), bands=((4, 3, 2),), levels=8), target, noise=2.0, depth=16)
-    noise = NoiseModel(**ingest("c", target.getvalue()).attributes["noise"])
-    for value in (0.05, 0.3, 0.8):
-        # The simulated camera's deviation is 0.002 + 0.006 sqrt(value), times `noise`.
-        deviation = float(noise.variance(np.array([value], np.float32))[0]) ** 0.5
-        assert deviation == pytest.approx(2 * (0.002 + 0.006 * value**0.5), rel=0.25)
 
 
 @pytest.mark.slow
