@@ -23,7 +23,7 @@ from services.runtime.problems import WrongMediaType
 from services.webhooks.sender import check_webhook
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id
-from storage.errors import CaptureError, Conflict, Corrupt, NotFound, Unavailable
+from storage.errors import CaptureError, Conflict, Corrupt, NotFound
 from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
 from storage.records import bodies, captures, jobs, uploads
@@ -111,19 +111,14 @@ async def _from_body(
         return earlier
     capture = new_id()
     most = context.settings.upload_bytes
-    async with reserved(context, capture, length, most, captures=1, jobs=1) as reservation:
-        try:
-            pieces = reservation.watch(limit.stream(request))
-            parts = [await store_as_upload(pieces, context.objects, capture)]
-            register = partial(_register, context, capture, parts, name, key, False, webhook)
-            row = await context.compute(request, context.captures, register, memory=CHECK_BYTES)
-        except Unavailable:  # there may be a capture; a sweep removes bytes without one
-            raise
-        except Exception:  # not when cancelled: `register` may still be running in its thread
-            await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
-            raise
+    remove = partial(stored_uploads.remove, context.objects, capture)
+    async with reserved(context, capture, length, most, remove=remove, captures=1, jobs=1) as reservation:
+        pieces = reservation.watch(limit.stream(request))
+        parts = [await store_as_upload(pieces, context.objects, capture)]
+        register = partial(_register, context, capture, parts, name, key, False, webhook)
+        row = await context.compute(request, context.captures, register, memory=CHECK_BYTES)
     if row.id != capture:  # a concurrent request with the same key was quicker
-        await anyio.to_thread.run_sync(stored_uploads.remove, context.objects, capture)
+        await anyio.to_thread.run_sync(remove)
     return row
 
 

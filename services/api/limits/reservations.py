@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 
 import anyio.to_thread
@@ -126,7 +126,15 @@ async def _next(pieces: AsyncIterator[bytes]) -> bytes | None:
 
 @asynccontextmanager
 async def reserved(
-    context: Context, id: str, size: int, limit: int, *, room: int = 0, captures: int = 0, jobs: int = 0
+    context: Context,
+    id: str,
+    size: int,
+    limit: int,
+    *,
+    remove: Callable[[], object] | None = None,
+    room: int = 0,
+    captures: int = 0,
+    jobs: int = 0,
 ) -> AsyncIterator[Reservation]:
     """Reserve room for the body of a request, until the block ends.
 
@@ -138,6 +146,8 @@ async def reserved(
         Bytes that the request announces, 0 if it announces none.
     limit : int
         Most bytes that it may have.
+    remove : callable, optional
+        Removes what the block has stored, if it fails.
     room : int
         Bytes that the disk must have in addition.
     captures, jobs : int
@@ -157,5 +167,11 @@ async def reserved(
     reservation = Reservation(context, id, min(size, STEP), size or limit, check_every=bodies.RENEW)
     try:
         yield reservation
+    except Unavailable:  # its row may be there; a sweep removes what has none
+        raise
+    except Exception:  # not when cancelled: a thread may still be at work on it
+        if remove is not None:
+            await anyio.to_thread.run_sync(remove)
+        raise
     finally:
         await anyio.to_thread.run_sync(reservation.release)

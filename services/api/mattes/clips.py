@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, BinaryIO
 
 import anyio.to_thread
@@ -23,7 +24,7 @@ from services.runtime.problems import BadRange, problem_of
 from services.webhooks.sender import check_webhook
 from storage.database.engine import reading
 from storage.database.rows import new_id
-from storage.errors import Conflict, Corrupt, Unavailable
+from storage.errors import Conflict, Corrupt
 from storage.layout import composites
 from storage.records import bodies, jobs, mattes
 
@@ -75,19 +76,14 @@ async def composite_clip(
     job = await context.call(find_earlier, context.engine, key, _call(matte), Job.read)
     if job is None:
         await context.call(_require_ready, context, matte)
-        id = new_id()
-        async with reserved(context, id, length, context.settings.upload_bytes, jobs=1) as reservation:
-            try:
-                pieces = reservation.watch(limit.stream(request))
-                size = await store_body(pieces, context.objects, composites.clip_path(id))
-                job = await context.call(_queue, context, id, matte, options, key, size, webhook)
-            except Unavailable:  # there may be a job; a sweep removes clips without one
-                raise
-            except Exception:  # not when cancelled: `_queue` may still be running in its thread
-                await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
-                raise
+        id, most = new_id(), context.settings.upload_bytes
+        remove = partial(context.objects.delete, composites.path(id))
+        async with reserved(context, id, length, most, remove=remove, jobs=1) as reservation:
+            pieces = reservation.watch(limit.stream(request))
+            size = await store_body(pieces, context.objects, composites.clip_path(id))
+            job = await context.call(_queue, context, id, matte, options, key, size, webhook)
         if job.id != id:  # a concurrent request with the same key was quicker
-            await anyio.to_thread.run_sync(context.objects.delete, composites.path(id))
+            await anyio.to_thread.run_sync(remove)
     headers = {"Location": f"/v1/jobs/{job.id}"}
     return Response(job.model_dump_json(), 202, headers, media_type=JSON)
 
