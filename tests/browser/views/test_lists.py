@@ -64,6 +64,19 @@ def test_list_is_searched_and_filtered_by_state(desk: Page, service: Service, ca
     expect(entries.filter(has_not_text="cancelled")).to_have_count(0)
 
 
+def test_a_job_that_a_newer_service_queued_is_listed(
+    desk: Page, service: Service, cancelled: list[str]
+) -> None:
+    def of_another_kind(route: Route) -> None:
+        answer = route.fetch()
+        found = answer.json()
+        route.fulfill(response=answer, json={"jobs": [job | {"kind": "newer"} for job in found["jobs"]]})
+
+    desk.route("**/v1/jobs?*", of_another_kind)
+    desk.goto(f"{service.url}/#/jobs")
+    expect(card(desk, cancelled[0])).to_contain_text("newer: a ball")
+
+
 @pytest.mark.parametrize("kind", ["captures", "mattes"])
 def test_names_are_searched(desk: Page, service: Service, ready: tuple[str, str], kind: str) -> None:
     desk.goto(f"{service.url}/#/{kind}")

@@ -12,7 +12,7 @@ const entries = menu.firstElementChild;
 const count = document.getElementById("active");
 let timer;
 
-export const jobTitle = ({ kind, name }) => t(`job.${kind}`) + (name && `: ${name}`);
+export const jobTitle = ({ kind, name }) => known(`job.${kind}`, kind) + (name && `: ${name}`);
 
 export const jobCard = (job, ...more) =>
 	h("a.card", { href: `#/jobs/${job.id}` }, h("span.name", jobTitle(job)), badge(job.state),
