@@ -11,8 +11,8 @@ from storage.objects.store import Objects
 
 
 @pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+def engine(sqlite: str) -> Iterator[Engine]:
+    engine = open_engine(sqlite)
     yield engine
     engine.dispose()
 
