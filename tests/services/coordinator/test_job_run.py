@@ -3,15 +3,14 @@
 import time
 from collections import deque
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, Engine, select
 
 from services.cluster.dispatcher import Outcome
 from services.coordinator import job_run
 from services.coordinator.job_run import LOSSES, JobRun
-from storage.database.engine import open_engine, writing
+from storage.database.engine import writing
 from storage.database.tables import tiles, totals
 from storage.errors import Corrupt, StoreUnavailable, Unavailable, WrongStore
 from storage.records import captures, jobs, mattes
@@ -23,11 +22,9 @@ LIMITS = Limits(1 << 30, 1 << 26)
 
 
 @pytest.fixture
-def connection(tmp_path: Path) -> Iterator[Connection]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+def connection(engine: Engine) -> Iterator[Connection]:
     with writing(engine) as connection:
         yield connection
-    engine.dispose()
 
 
 @pytest.fixture
@@ -45,13 +42,15 @@ def start(connection: Connection, job: str) -> JobRun:
     return run
 
 
-def advance(connection: Connection, run: JobRun, *news: Outcome, under_way: int = 0) -> bool:
+def advance(
+    connection: Connection, run: JobRun, *news: Outcome, under_way: int = 0, threads: int = 2
+) -> bool:
     """Record and write outcomes of tiles; returns whether the job continues."""
     for outcome in news:
         if outcome.tile in run.to_do:
             run.to_do.remove(outcome.tile)
         run.record_outcome(outcome)
-    following = run.write(connection, 3, 2, under_way)
+    following = run.write(connection, 3, threads, under_way)
     run.advance(following)
     return not following.ended
 
@@ -75,7 +74,9 @@ def test_steps_run_in_order(connection: Connection, job: str) -> None:
     assert list(run.to_do) == [PREPARE]
     assert advance(connection, run, done(run, PREPARE, {"tiles": 3}))
     assert (run.stage, sorted(run.to_do), run.task.plan) == ("recovering", [0, 1, 2], {"tiles": 3})
+    run.to_do.clear()  # all are submitted
     assert advance(connection, run, done(run, 0), done(run, 1), under_way=1)
+    assert run.stage == "recovering"
     assert advance(connection, run, done(run, 2))
     assert (run.stage, list(run.to_do)) == ("finishing", [FINISH])
     assert not advance(connection, run, done(run, FINISH, {"width": 4}))
@@ -124,6 +125,9 @@ def test_lost_tiles_are_repeated_without_counting_as_failures(connection: Connec
     for _ in range(20):
         assert advance(connection, run, Outcome(job, 1))
         assert sorted(run.to_do) == [0, 1, 2]
+    run.to_do.clear()
+    assert advance(connection, run, done(run, 0), Outcome(job, 1), done(run, 2))
+    assert (run.stage, list(run.to_do)) == ("recovering", [1])
     assert lines(connection, job)[-1] == "recovering"
 
 
@@ -162,6 +166,9 @@ def test_outage_of_the_store_is_waited_for(
     assert (run.held, run.without_store) == (False, False)
     assert advance(connection, run, away)
     assert lines(connection, job).count(lines(connection, job)[-1]) == 2  # it is another outage
+    assert run.held
+    assert advance(connection, run, done(run, 2), under_way=1)
+    assert not run.held  # a worker reaches it: nothing is waited for
 
 
 def test_a_worker_that_does_not_see_the_store_neither_holds_the_job_nor_fails_it(
@@ -215,16 +222,51 @@ def test_missing_tiles_are_repeated(connection: Connection, job: str) -> None:
     assert (run.stage, list(run.to_do)) == ("recovering", [1])
     assert advance(connection, run, done(run, 1))
     assert (run.stage, list(run.to_do)) == ("finishing", [FINISH])
+    assert advance(connection, run, Outcome(job, FINISH, error=OSError()))  # it was not done before
     assert not advance(connection, run, done(run, FINISH, {}))
     row = jobs.get(connection, job)
     assert (row.state, row.done, row.pixels) == ("succeeded", 3, 30)
 
 
-def test_a_cancelled_job_does_not_succeed(connection: Connection, job: str) -> None:
+def test_store_that_loses_a_tile_each_time_fails_the_job(connection: Connection, job: str) -> None:
+    run = working(connection, job)
+    advance(connection, run, *(done(run, n) for n in range(3)))
+    for _ in range(LOSSES - 1):
+        assert advance(connection, run, done(run, FINISH, {"missing": [1]}))
+        assert advance(connection, run, done(run, 1))
+    assert not advance(connection, run, done(run, FINISH, {"missing": [1, 2]}))
+    row = jobs.get(connection, job)
+    assert row.state == "failed"
+    assert row.problem["detail"].startswith("the store loses what is written to it: 2 tiles are missing")
+
+
+def test_pace_is_measured_again_where_it_changes(connection: Connection, job: str) -> None:
+    run = working(connection, job, tiles=9)
+
+    def paced_from(*tiles: int, threads: int = 2) -> int | None:
+        """Do tiles; returns how many were done when the pace was last measured."""
+        assert advance(connection, run, *(done(run, tile) for tile in tiles), under_way=1, threads=threads)
+        row = jobs.get(connection, job)
+        return None if row.paced_at is None else row.paced_done
+
+    assert [paced_from(0), paced_from(1), paced_from(2)] == [None, 2, 2]
+    assert [paced_from(3, threads=3), paced_from(4, threads=3)] == [4, 4]
+    for paused in (True, False):
+        jobs.pause(connection, job, paused)
+        run.follow(jobs.get(connection, job))
+    assert [paced_from(threads=3), paced_from(5, threads=3), paced_from(6, threads=3)] == [None, 6, 6]
+    advance(connection, run, done(run, 7), done(run, 8), threads=3)
+    assert advance(connection, run, done(run, FINISH, {"missing": [0, 1]}), threads=3)
+    assert [paced_from(threads=3), paced_from(0, threads=3)] == [None, 9]
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_cancelled_job_neither_succeeds_nor_fails(connection: Connection, job: str, fails: bool) -> None:
     run = working(connection, job)
     advance(connection, run, *(done(run, n) for n in range(3)))
     jobs.cancel(connection, job)
-    assert not advance(connection, run, done(run, FINISH, {}))
+    end = Outcome(job, FINISH, error=Corrupt("it is damaged")) if fails else done(run, FINISH, {})
+    assert not advance(connection, run, end)
     assert jobs.get(connection, job).state == "cancelled"
     assert mattes.get(connection, "mat").state == "recovering"
 

@@ -89,6 +89,7 @@ def test_retry_keeps_done_tiles(connection: Connection) -> None:
     jobs.enter_stage(connection, job, "recovering")
     tiles.mark_done(connection, job, [(0, 0.1, 10)])
     tiles.record_failure(connection, job, 1, "why", 1)
+    tiles.record_loss(connection, job, 2, "it died", 2)
     jobs.end(connection, job, "failed", {"detail": "a tile failed"})
     jobs.retry(connection, job)
     row = jobs.get(connection, job)
@@ -96,6 +97,7 @@ def test_retry_keeps_done_tiles(connection: Connection) -> None:
     assert (row.problem, row.finished_at) == (None, None)
     assert tiles.remaining(connection, job) == [1, 2]
     assert tiles.record_failure(connection, job, 1, "again", 2)
+    assert tiles.record_loss(connection, job, 2, "again", 2)
 
 
 def test_retry_with_new_plan(connection: Connection) -> None:
