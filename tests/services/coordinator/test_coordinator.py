@@ -1,7 +1,6 @@
 """Jobs that end before they start, files that are still written when they are removed, and the cost of progress."""
 
 import re
-import threading
 import time
 from collections.abc import Sequence
 from itertools import pairwise
@@ -13,65 +12,23 @@ from sqlalchemy import Connection, Engine, Row
 
 from services.api.jobs.situation import Situation
 from services.api.jobs.wait_reason import reason
-from services.cluster.dispatcher import Outcome
 from services.coordinator import coordinator, job_run
 from services.coordinator.coordinator import POLL, WRITE, Coordinator
 from services.coordinator.job_kinds import JOB_KINDS
 from services.coordinator.job_run import JobRun, Next
 from services.settings import CoordinatorSettings
 from storage.database.engine import reading, writing
-from storage.errors import CaptureError, EnvmatteError, NotFound, StoreUnavailable, Unavailable
+from storage.errors import CaptureError, NotFound, StoreUnavailable, Unavailable
 from storage.layout import uploads
 from storage.objects.store import Objects
 from storage.records import captures, jobs, leases, mattes, tiles
 from storage.steps import PREPARE
 from tests.benchmarks.cluster.overhead import measure
 from tests.parts.waiting import until
+from tests.services.coordinator.dispatchers import Failing, Idle, Refusing, Working
 
 OTHERS = 15
 """Writes once per job, or every few seconds in any case: start, stages, lease."""
-
-
-class Idle:
-    """A dispatcher whose cluster has one free thread that never ends a task."""
-
-    free = threads = 1
-
-    def __init__(self) -> None:
-        self.news = threading.Event()
-        self.cluster: dict[str, Any] = {}
-        self.submitted: list[tuple[str, int]] = []
-
-    def want(self, tiles: int) -> None:
-        pass
-
-    def under_way(self, job: str) -> int:
-        return sum(one == job for one, _ in self.submitted)
-
-    def submit(self, steps: Any, task: Any, tiles: list[list[int]], trace: str | None = None) -> bool:
-        self.submitted += [(task.job, tile) for some in tiles for tile in some]
-        return True
-
-    def collect(self) -> list[Any]:
-        return []
-
-    def drop(self, job: str) -> None:
-        pass
-
-
-class Failing(Idle):
-    """A dispatcher whose worker fails each tile with an error."""
-
-    def __init__(self, error: EnvmatteError) -> None:
-        super().__init__()
-        self.error = error
-        self.cluster = {"workers": [], "problem": None}
-        self.tried: list[tuple[str, int]] = []
-
-    def collect(self) -> list[Outcome]:
-        tried, self.submitted = self.submitted, []
-        self.tried += tried
-        return [Outcome(job, tile, error=self.error) for job, tile in tried]
 
 
 @pytest.fixture
@@ -141,6 +98,48 @@ def test_paused_job_is_not_run_until_it_is_continued(
             jobs.pause(c, job, True)  # what is submitted stays
         time.sleep(3 * POLL)
     assert dispatcher.submitted == [(job, PREPARE)]
+
+
+def recovery(engine: Engine, matte: str, count: int) -> str:
+    """A queued recovery that has its tiles."""
+    with writing(engine) as c:
+        job = jobs.add(c, "recover", "ready", {}, matte)
+        mattes.add(c, matte, "ready", job, {})
+        tiles.add_plan(c, job, {"tiles": count})
+    return job
+
+
+@pytest.fixture
+def ready(engine: Engine) -> None:
+    """The capture ``ready``, which is."""
+    with writing(engine) as c:
+        captures.add(c, "ready", "", name="", bytes=3, frames=1, program={})
+        captures.change(c, "ready", state="ready")
+
+
+def test_tiles_that_could_not_be_submitted_are_submitted_again(
+    engine: Engine, objects: Objects, ready: None, tmp_path: Path
+) -> None:
+    job = recovery(engine, "m", 3)
+    dispatcher = Refusing()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+        until(lambda: len(dispatcher.submitted) == 3)
+    assert dispatcher.submitted == [(job, tile) for tile in dispatcher.refused]
+
+
+def test_jobs_share_the_workers_from_the_start_of_the_later_one(
+    engine: Engine, objects: Objects, ready: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(coordinator, "POLL", 0.02)
+    large = recovery(engine, "large", 1000)
+    dispatcher = Working()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+        until(lambda: len(dispatcher.done) >= 10)
+        small = recovery(engine, "small", 9)
+        until(lambda: dispatcher.done.count(small) >= 9)
+    begin = dispatcher.done.index(small)
+    together = dispatcher.done[begin : begin + 16]
+    assert 7 <= together.count(large) <= 9
 
 
 @pytest.mark.parametrize(
