@@ -1,13 +1,21 @@
 """What expires and what is counted, with a real database and a real store."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
 
 import pytest
-from sqlalchemy import Engine, select, update
+from sqlalchemy import Connection, Engine, select, update
 
 from services.coordinator import retention
-from services.coordinator.retention import count_bytes, delete_expired, delete_old_jobs, sweep
+from services.coordinator.retention import (
+    count_bytes,
+    delete_expired,
+    delete_old_jobs,
+    sweep,
+    sweep_uploads,
+)
 from storage import statistics
 from storage.database import tables
 from storage.database.engine import open_engine, reading, writing
@@ -17,9 +25,10 @@ from storage.layout import captures as stored_captures
 from storage.layout import composites
 from storage.layout import mattes as stored_mattes
 from storage.layout import uploads as stored_uploads
+from storage.layout.uploads import Part
 from storage.objects.checksums import SUFFIX
 from storage.objects.store import Objects
-from storage.records import bodies, captures, idempotency, jobs, mattes, tiles, uploads
+from storage.records import bodies, captures, idempotency, jobs, links, mattes, tiles, uploads
 
 
 @pytest.fixture
@@ -64,8 +73,10 @@ def test_only_expired_rows_are_deleted(engine: Engine) -> None:
             assert row.expires_at == row.created_at + 60
             c.execute(update(table).where(table.c.id == "short").values(expires_at=time.time() - 1))
         uploads.add(c, "u", 5, "", -1, None)
+        links.create(c, "ever", -1)
     with writing(engine) as c:
         assert delete_expired(c) == ["uploads/u", "captures/short", "uploads/short", "mattes/short"]
+        assert c.execute(select(tables.links)).all() == []
     assert existing(engine) == {"captures": {"long", "ever"}, "mattes": {"long", "ever"}}
     with reading(engine) as c:
         assert jobs.get(c, "short-r").state == "succeeded"  # the record of its job stays
@@ -169,6 +180,29 @@ def test_old_jobs_are_deleted_unless_their_results_exist(engine: Engine, objects
             assert set(c.scalars(select(table.c.job))) <= listed(engine)
 
 
+def test_job_that_is_retried_while_old_ones_are_searched_is_kept(
+    engine: Engine, objects: Objects, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with writing(engine) as c:
+        job = jobs.add(c, "recover", "gone", {}, "gone")
+        jobs.end(c, job, "failed", {"detail": "", "status": 500})
+    age_jobs(engine)
+    meanwhile(monkeypatch, lambda c: jobs.retry(c, job))
+    delete_old_jobs(engine, objects, 60)
+    assert listed(engine) == {job}
+
+
+def meanwhile(monkeypatch: pytest.MonkeyPatch, change: Callable[[Connection], None]) -> None:
+    """Change something between what retention reads and what it writes."""
+
+    def after_a_change(engine: Engine) -> AbstractContextManager[Connection]:
+        with writing(engine) as c:
+            change(c)
+        return writing(engine)
+
+    monkeypatch.setattr(retention, "writing", after_a_change)
+
+
 def test_idempotency_key_is_kept_as_long_as_its_result(engine: Engine, objects: Objects) -> None:
     add(engine, "alice", "thing")
     with writing(for_owner(engine, "alice")) as c:
@@ -226,6 +260,46 @@ def test_bytes_are_counted_once_complete(engine: Engine, objects: Objects) -> No
     assert stored("alice") == 7 + 999 + 20_000 + 64 + 5 * each + rows
     with reading(for_owner(engine, "bob")) as c:
         assert statistics.stored_bytes(c, all_owners=True) == 7 + 999 + 20_000 + 64 + 5 * each + rows + of_bob
+
+
+def test_what_begins_again_while_it_is_counted_is_counted_later(
+    engine: Engine, objects: Objects, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add(engine, "alice", "a")
+    with writing(engine) as c:
+        mattes.delete(c, "a")
+        captures.change(c, "a", state="failed")
+    meanwhile(monkeypatch, lambda c: captures.change(c, "a", state="ingesting"))
+    count_bytes(engine, objects)
+    with reading(engine) as c:
+        assert captures.get(c, "a").stored is None
+
+
+def test_start_removes_what_killed_requests_have_left(engine: Engine, objects: Objects) -> None:
+    with writing(engine) as c:
+        uploads.add(c, "u", 10, "", 60, None)
+        bodies.claim(c, "b", "u", 10)
+        uploads.advance(c, "u", 0, [Part("recorded", 5)], 60)
+    for name in ("recorded", "other"):
+        objects.put(stored_uploads.part_path("u", name), b"bytes")
+    sweep_uploads(engine, objects)
+    assert objects.names(stored_uploads.path("u")) == ["recorded.part"]
+    with writing(engine) as c:
+        assert bodies.claim(c, "next", "u", 5)
+
+
+def test_sweep_removes_files_that_killed_writers_left_of_a_video(engine: Engine, tmp_path: Path) -> None:
+    objects = Objects((tmp_path / "store").as_uri())
+    with writing(engine) as c:
+        job = jobs.add(c, "composite", "", {}, "m")
+    objects.put(composites.clip_path(job), b"clip")
+    unfinished = tmp_path / "store" / f"{composites.video_path(job)}#1"
+    unfinished.write_bytes(b"half")
+    sweep(engine, objects, objects.clock() - 60)
+    assert unfinished.exists()  # it may be under way
+    sweep(engine, objects, objects.clock() + 60)
+    assert not unfinished.exists()
+    assert objects.paths_below("composites") == {composites.clip_path(job)}
 
 
 def test_sweep_leaves_what_a_request_has_uploaded(engine: Engine, objects: Objects) -> None:
