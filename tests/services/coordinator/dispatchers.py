@@ -8,7 +8,7 @@ from storage.errors import EnvmatteError
 
 
 class Idle:
-    """A dispatcher whose cluster has one free thread that never ends a task."""
+    """A dispatcher whose cluster has one free thread that ends no task unless a test says so."""
 
     free = threads = 1
 
@@ -16,6 +16,8 @@ class Idle:
         self.news = threading.Event()
         self.cluster: dict[str, Any] = {}
         self.submitted: list[tuple[str, int]] = []
+        self.dropped: list[str] = []
+        self.outcomes: list[Outcome] = []
 
     def want(self, tiles: int) -> None:
         pass
@@ -27,11 +29,12 @@ class Idle:
         self.submitted += [(task.job, tile) for some in tiles for tile in some]
         return True
 
-    def collect(self) -> list[Any]:
-        return []
+    def collect(self) -> list[Outcome]:
+        outcomes, self.outcomes = self.outcomes, []
+        return outcomes
 
     def drop(self, job: str) -> None:
-        pass
+        self.dropped.append(job)
 
 
 class Refusing(Idle):

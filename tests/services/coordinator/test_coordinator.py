@@ -12,6 +12,7 @@ from sqlalchemy import Connection, Engine, Row
 
 from services.api.jobs.situation import Situation
 from services.api.jobs.wait_reason import reason
+from services.cluster.dispatcher import Outcome
 from services.coordinator import coordinator, job_run
 from services.coordinator.coordinator import POLL, WRITE, Coordinator
 from services.coordinator.job_kinds import JOB_KINDS
@@ -98,6 +99,35 @@ def test_paused_job_is_not_run_until_it_is_continued(
             jobs.pause(c, job, True)  # what is submitted stays
         time.sleep(3 * POLL)
     assert dispatcher.submitted == [(job, PREPARE)]
+
+
+def test_superseded_coordinator_drops_its_jobs_and_writes_nothing(
+    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(coordinator, "BEAT", 3600.0)  # as if it were frozen between two heartbeats
+    with writing(engine) as c:
+        leases.acquire(c, "one that was killed")
+    dispatcher, begin = Idle(), time.monotonic()
+    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher) as one:  # type: ignore[arg-type]
+        until(lambda: dispatcher.submitted)
+        assert time.monotonic() - begin < leases.SECONDS  # no other runs on the same folder: it need not wait
+        with writing(engine) as c:
+            other = leases.acquire(c, "another", seize=True)
+        dispatcher.outcomes = [Outcome(job, PREPARE, done=(1.0, {"tiles": 3}))]
+        until(lambda: one.token is None)
+        until(lambda: dispatcher.dropped)
+        with writing(engine) as c:
+            assert jobs.get(c, job).plan is None
+            assert other is not None
+            leases.release(c, other)
+        dispatcher.submitted.clear()
+        monkeypatch.setattr(coordinator, "BEAT", 0.1)
+        until(lambda: dispatcher.submitted)
+    assert dispatcher.dropped == [job]
+    with reading(engine) as c:
+        last = leases.last_heartbeat(c)
+    assert last
+    assert last.holder is None  # so that the next one need not wait
 
 
 def recovery(engine: Engine, matte: str, count: int) -> str:
