@@ -245,9 +245,7 @@ def _require_empty_database(connection: Connection) -> None:
         )
     if "coordinator" in tables and "holder" in tables["coordinator"].c:
         lease = tables["coordinator"].c
-        if connection.scalar(
-            select(lease.holder).where(lease.holder.is_not(None), lease.expires_at > clock())
-        ):
+        if connection.scalar(select(lease.holder).where(lease.expires_at > clock())):
             raise Conflict("a service runs on the installation; stop it until the backup is restored")
 
 

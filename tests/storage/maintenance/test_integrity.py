@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine
 
+from storage.database.engine import writing
 from storage.maintenance.verify import verify
 from storage.objects.store import Objects
+from storage.records import mattes
 from tests.storage.installation import contents, flip
 from tests.storage.maintenance.test_verify import NOT_READ, found
 
@@ -60,6 +62,15 @@ def test_missing_item_is_found(engine: Engine, filled: Objects) -> None:
     missing = {path for what, path in found(verify(engine, filled)) if what == "missing"}
     assert {"captures/c/frames/zarr.json", "mattes/m/S/zarr.json", "uploads/u/p.part"} <= missing
     assert "composites/v/video.mp4" in missing
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+def test_only_damage_counts_of_what_a_failed_job_left(engine: Engine, filled: Objects) -> None:
+    with writing(engine) as c:
+        mattes.change(c, "m", state="failed")
+    filled.delete("mattes/m/S/c/0/0/0")
+    flip(filled, "mattes/m/S/c/1/2/0")
+    assert found(verify(engine, filled)) == {("damaged", "mattes/m/S/c/1/2/0")}
 
 
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)

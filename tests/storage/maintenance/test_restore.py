@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
@@ -9,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import Engine, func, select, text
+from sqlalchemy import Engine, PoolProxiedConnection, func, select, text, update
 
 from storage.database import dialects, migrations
 from storage.database import tables as database_tables
 from storage.database.engine import open_engine, reading, writing
 from storage.database.revision import NEWEST, revision
-from storage.errors import Conflict, InvalidInput
+from storage.errors import Conflict, InvalidInput, NoRoom, Unavailable
 from storage.maintenance import row_dump
 from storage.maintenance.backup import LEDGER, MANIFEST, back_up
 from storage.maintenance.restore import MARKER, restore
@@ -23,6 +24,7 @@ from storage.maintenance.row_dump import open_without_upgrade
 from storage.maintenance.verify import verify
 from storage.objects.store import Objects
 from storage.records import jobs, leases, tiles
+from tests.parts.disks import small_disk
 from tests.storage.installation import contents, fill, flip
 
 KILLED = """
@@ -146,10 +148,71 @@ def test_only_into_empty_targets(
         leases.acquire(c, "somebody")
     with pytest.raises(Conflict, match="a service runs on the installation; stop it"):
         restore(target, *elsewhere)
-    with writing(used) as c:
-        leases.release(c, 1)
+    with writing(used) as c:  # as when it was killed
+        c.execute(update(database_tables.coordinator).values(expires_at=0))
     restore(target, *elsewhere)
     used.dispose()
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+def test_backup_larger_than_the_disk_is_refused(
+    engine: Engine, filled: Objects, folder: Path, target: Objects, elsewhere: tuple[Engine, Objects]
+) -> None:
+    size = back_up(engine, filled, target, "1")["bytes"]
+    with small_disk(folder.parent / "disk", 1 << 20) as disk:
+        store = Objects(disk.as_uri())
+        with pytest.raises(
+            NoRoom, match=rf"the backup has {size} bytes, but the disk of the store only \d+ free"
+        ):
+            restore(target, elsewhere[0], store)
+        require_empty(elsewhere[0], store)
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+def test_rows_that_are_added_meanwhile_are_kept(
+    engine: Engine, filled: Objects, folder: Path, target: Objects, elsewhere: tuple[Engine, Objects]
+) -> None:
+    back_up(engine, filled, target, "1")
+    url = elsewhere[0].url.render_as_string(hide_password=False)
+
+    def meanwhile(share: float, size: int) -> None:
+        used = open_engine(url)
+        with writing(used) as c:
+            if not jobs.to_run(c):
+                jobs.add(c, "ingest", "new", {}, job="added")
+        used.dispose()
+
+    with pytest.raises(Conflict, match=r"its database has rows \(1 of jobs"):
+        restore(target, *elsewhere, meanwhile)
+    with reading(elsewhere[0]) as c:
+        assert [row.id for row in jobs.to_run(c)] == ["added"]
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+def test_restore_whose_commit_is_not_confirmed_keeps_its_objects(
+    engine: Engine,
+    filled: Objects,
+    folder: Path,
+    target: Objects,
+    elsewhere: tuple[Engine, Objects],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    back_up(engine, filled, target, "1")
+    second, store = elsewhere
+    broken = sqlite3.OperationalError()
+    broken.sqlite_errorcode = sqlite3.SQLITE_IOERR
+    commit, breaks = second.dialect.do_commit, [broken]
+
+    def do_commit(connection: PoolProxiedConnection) -> None:
+        commit(connection)
+        if breaks:
+            raise breaks.pop()
+
+    monkeypatch.setattr(second.dialect, "do_commit", do_commit)
+    with pytest.raises(Unavailable):
+        restore(target, second, store)
+    assert rows_of(second) == rows_of(engine)
+    assert contents(store) == contents(filled)
 
 
 def change(index: int, **values: Any) -> Callable[[list[bytes]], None]:

@@ -64,6 +64,15 @@ def test_items_that_change_meanwhile_are_not_reported(engine: Engine, filled: Ob
 
 
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+def test_object_that_is_written_meanwhile_is_not_reported(engine: Engine, filled: Objects) -> None:
+    path = "mattes/m/S/c/1/2/0"
+    data = filled.read_raw(path)
+    filled.delete(path)
+    report = verify(engine, filled, lambda share, size: filled.write_raw(path, [data]))
+    assert report.findings == []
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_old_objects_without_a_row_are_reported(engine: Engine, filled: Objects, folder: Path) -> None:
     filled.put("mattes/unknown/S/c/0", b"any")
     filled.put("uploads/unknown/all.part", b"any")
