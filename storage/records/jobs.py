@@ -86,7 +86,7 @@ def to_run(connection: Connection) -> Sequence[Row[Any]]:
     Only their ``id``, ``paused`` and ``region``: they may be many, and their plans large.
     """
     ingesting = select(captures.c.id).where(captures.c.state == "ingesting")
-    waits = (jobs.c.state == "queued") & (jobs.c.kind == "recover") & jobs.c.capture.in_(ingesting)
+    waits = (jobs.c.kind == "recover") & jobs.c.capture.in_(ingesting)
     query = select(*(jobs.c[name] for name in ("id", "paused", "region"))).order_by(jobs.c.number)
     return connection.execute(query.where(jobs.c.state.in_(ACTIVE), ~waits)).all()
 

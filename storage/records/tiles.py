@@ -68,7 +68,7 @@ def mark_done(connection: Connection, job: str, finished: Sequence[tuple[int, fl
     connection.execute(
         update(tiles)
         .where(tiles.c.job == job, tiles.c.tile == bindparam("which"))
-        .values(state="done", seconds=bindparam("took"), attempts=tiles.c.attempts + 1),
+        .values(state="done", seconds=bindparam("took")),
         [{"which": tile, "took": seconds} for tile, (seconds, _) in ended.items()],
     )
     new = [tile for tile in ended if tile >= 0 and states[tile] == "queued"]

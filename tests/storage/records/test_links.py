@@ -29,6 +29,8 @@ def test_link_works_until_it_is_deleted(engine: Engine, matte: str) -> None:
             links.find(c, token[:-1])
         assert len(links.list_all(c, matte)) == 2
     with writing(for_owner(engine, "alice")) as c:
+        with pytest.raises(NotFound, match="matte m2 has no link"):
+            links.remove(c, "m2", row.id)
         links.remove(c, matte, row.id)
         with pytest.raises(NotFound, match="has no link"):
             links.remove(c, matte, row.id)

@@ -8,6 +8,13 @@ from storage.errors import NotFound
 from storage.records import mattes
 
 
+def test_imported_matte_expires_too(engine: Engine) -> None:
+    with writing(engine) as connection:
+        mattes.add_imported(connection, "m", {}, {}, seconds=60)
+        row = mattes.get_ready(connection, "m")
+        assert row.expires_at == row.created_at + 60
+
+
 def test_rows_are_added_changed_and_deleted(engine: Engine) -> None:
     with writing(engine) as connection:
         mattes.add(connection, "m1", "c1", "j1", {"method": "lobes"})

@@ -77,6 +77,7 @@ def test_missing_tile_is_done_again_and_counts_once(connection: Connection) -> N
     tiles.mark_done(connection, job, [(n, 0.1, 10) for n in range(3)])
     assert tiles.requeue_missing(connection, job, [0, 2], 2) == [0, 2]
     assert tiles.remaining(connection, job) == [0, 2]
+    assert tiles.record_failure(connection, job, 2, "why", 2)  # it has not failed before
     assert (jobs.get(connection, job).done, jobs.get(connection, job).pixels) == (3, 30)
     tiles.mark_done(connection, job, [(0, 0.1, 10), (2, 0.1, 10)])
     assert (jobs.get(connection, job).done, jobs.get(connection, job).pixels) == (3, 30)

@@ -29,6 +29,7 @@ def test_upload_advances_by_recorded_parts(engine: Engine) -> None:
         before = uploads.get(c, "u")
         assert (before.offset, before.length, before.metadata, before.parts) == (0, 10, "name YQ==", 0)
         assert uploads.advance(c, "u", 0, [Part("a", 3), Part("b", 4)], 2 * DAY) == 7
+        assert uploads.get(c, "u").parts == 2
         assert uploads.advance(c, "u", 7, [], 2 * DAY) == 7
         after = uploads.get(c, "u")
         assert (after.offset, after.parts) == (7, 2)
