@@ -1,5 +1,6 @@
 """A store that fails: full disks, and buckets that do not answer."""
 
+import errno
 import os
 import shutil
 import socket
@@ -13,11 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from obstore.exceptions import GenericError
 
 from storage.errors import NoRoom, StoreUnavailable, Unavailable
 from storage.objects import store as module
 from storage.objects.byte_objects import PART
 from storage.objects.event_loop import gather
+from storage.objects.retries import translate_errors
 from storage.objects.store import Objects
 from tests.parts.waiting import until
 from tests.storage.conftest import DISK
@@ -192,6 +195,23 @@ def test_missing_object_of_a_bucket_is_no_refusal(s3: str) -> None:
         Objects(s3).read_raw("a")
     with pytest.raises(FileNotFoundError):
         Objects(s3).read("a")
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [
+        (errno.ENOSPC, NoRoom),
+        (errno.EDQUOT, NoRoom),
+        (errno.EROFS, StoreUnavailable),
+        (errno.EACCES, StoreUnavailable),
+        (errno.EPERM, StoreUnavailable),
+        (errno.ENOENT, FileNotFoundError),
+    ],
+)
+def test_errors_of_a_disk_are_told_apart_by_their_number(number: int, kind: type[Exception]) -> None:
+    """As obstore words them: a quota and a disk that may only be read can't be set up here."""
+    with pytest.raises(kind), translate_errors():
+        raise GenericError(f"Generic LocalFileSystem error: {os.strerror(number)} (os error {number})")
 
 
 @pytest.mark.parametrize("piece", [1 << 18, 9 << 20, 2 * DISK], ids=["crumbs", "parts", "at once"])

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import zarr
 from numpy.typing import NDArray
+from obstore.exceptions import BaseError
 from zarr.storage import MemoryStore
 
 from storage.errors import Corrupt, StoreUnavailable
@@ -70,6 +71,17 @@ def test_failed_writer_leaves_no_object(objects: Objects, folder: Path) -> None:
         objects.read("uploads/a.zip")
 
 
+@pytest.mark.parametrize("write", [Objects.put, stream])
+def test_object_whose_checksums_cannot_be_written_is_not_kept(
+    objects: Objects, folder: Path, write: Callable[[Objects, str, bytes], None]
+) -> None:
+    (folder / "a.crc32c" / "in the way").mkdir(parents=True)
+    with pytest.raises(BaseError):
+        write(objects, "a", b"data")
+    with pytest.raises(FileNotFoundError):  # not one without checksums
+        objects.read("a")
+
+
 def test_listing_and_deleting(objects: Objects, folder: Path) -> None:
     for path in ("c/1/x", "c/1/deep/y", "c/2/x", "c/10/x", "c/file"):
         stream(objects, path, b"data")
@@ -83,6 +95,7 @@ def test_listing_and_deleting(objects: Objects, folder: Path) -> None:
     objects.delete("c/1")
     objects.delete("never/there")
     assert objects.names("c") == ["10", "2"]
+    assert set(objects.sizes("c")) == {"c/10/x", "c/10/x.crc32c", "c/2/x", "c/2/x.crc32c"}
 
 
 def test_folder_is_removed_while_others_write_into_it_and_remove_it(tmp_path: Path) -> None:
