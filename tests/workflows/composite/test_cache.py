@@ -23,9 +23,8 @@ EDGE = 32
 def matte(objects: Objects) -> Matte:
     """Of 4 rows of two strips, of which the second has two blocks; each block with its number in S."""
     width = LENGTH + 2 * EDGE
-    made = mattes.create(
-        objects, "m", height=128, width=width, columns=8, rows=6, crosstalk=np.eye(3).tolist()
-    )
+    given = {"monitor": [8, 6], "crosstalk": np.eye(3).tolist()}
+    made = mattes.create(objects, "m", height=128, width=width, columns=8, rows=6, **given)
     assert made.block == EDGE
     for row in range(4):
         for column in range(made.block_columns):
@@ -154,8 +153,24 @@ def test_matte_deleted_while_it_is_read_is_an_error_for_all_readers(
 def test_nothing_is_kept_of_a_matte_that_is_forgotten(objects: Objects, matte: Matte) -> None:
     cache = Cache(objects, 1 << 20)
     cache.strip("m", 0, 0)
+    cache.places("m", 1)
     cache.forget("m")
     assert cache.bytes == 0
     objects.delete(mattes.path("m"))
-    with pytest.raises(Corrupt, match="m is not in the store"):
-        cache.strip("m", 0, 0)
+    for read in (lambda: cache.strip("m", 0, 0), lambda: cache.places("m", 1)):
+        with pytest.raises(Corrupt, match="m is not in the store"):
+            read()
+
+
+def test_mattes_that_were_not_used_for_long_are_opened_again(
+    objects: Objects, matte: Matte, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cache_module, "OPEN", 2)
+    for id in ("n", "o"):
+        mattes.create(objects, id, height=16, width=16, columns=8, rows=6, crosstalk=np.eye(3).tolist())
+    cache = Cache(objects, 1 << 20)
+    first, second = cache.matte("m"), cache.matte("n")
+    assert cache.matte("m") is first
+    cache.matte("o")
+    assert cache.matte("m") is first
+    assert cache.matte("n") is not second

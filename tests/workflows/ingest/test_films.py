@@ -2,11 +2,13 @@
 
 import io
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import av
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from storage.errors import CaptureError, Unavailable
 from tests.workflows.composite.video.test_steps import clip, even, pictures
@@ -14,7 +16,7 @@ from tests.workflows.ingest.video.camera import fragmented, overstated
 from workflows.ingest import films
 from workflows.ingest.video.decoder import open_clip
 from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
-from workflows.ingest.video.signatures import take_signatures
+from workflows.ingest.video.signatures import CELLS, take_signatures
 from workflows.untrusted.decoder import Decoder
 
 IMAGE = 1 << 20
@@ -56,6 +58,42 @@ def test_means_of_another_size_end_the_decoder(decoder: Decoder) -> None:
     plan = [[Share(int(ticks[0]), TOTAL_WEIGHT)]]
     with pytest.raises(Unavailable, match=r"film\.mp4 ended"):
         list(films.means(decoder, io.BytesIO(FILM), "film.mp4", plan, 7, 7))
+    assert decoder.has_ended
+
+
+SIGNATURES, TICKS, GREY, FRAMES = range(1, 5)
+
+
+@pytest.mark.parametrize(
+    ("which", "change"),
+    [
+        (SIGNATURES, lambda values: values[1:]),
+        (SIGNATURES, lambda values: values.astype(np.float32)),
+        (SIGNATURES, lambda values: values[..., 0]),
+        (SIGNATURES, lambda values: values[..., :2]),
+        (SIGNATURES, lambda values: values.repeat(CELLS[0] + 1, axis=2)),
+        (SIGNATURES, lambda values: values.repeat(CELLS[1] + 1, axis=1)),
+        (TICKS, lambda values: values[::-1].copy()),
+        (TICKS, lambda values: np.zeros_like(values)),
+        (GREY, lambda values: values[1:]),
+        (FRAMES, lambda values: values - 1),
+        (FRAMES, lambda values: values + 9),
+        (FRAMES, lambda values: values.astype(np.float32)),
+    ],
+)
+def test_what_no_film_gives_ends_the_decoder(
+    decoder: Decoder,
+    monkeypatch: pytest.MonkeyPatch,
+    which: int,
+    change: Callable[[NDArray[Any]], NDArray[Any]],
+) -> None:
+    file = io.BytesIO(FILM)
+    given = {"entry": "film.mp4", "memory": IMAGE, "max_bytes": IMAGE, "every": 0.2}
+    answers: list[Any] = list(decoder.run(films._scan, file, **given))
+    answers[which] = change(answers[which])
+    monkeypatch.setattr(decoder, "run", lambda *_, **__: iter(answers))
+    with pytest.raises(Unavailable, match=r"film\.mp4 ended"):
+        films.scan(decoder, file, "film.mp4", IMAGE, 0.2)
     assert decoder.has_ended
 
 

@@ -6,6 +6,7 @@ import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,25 @@ def test_missing_slab_is_corrupt(make_zip: Zip, ingest: Ingest) -> None:
     data = archive_of(make_zip, shots(len(PATTERNS), 3, "uint16"), PATTERNS)
     with pytest.raises(Corrupt, match=r"c/thumbnails/c/0/0/0 is missing"):
         ingest("c", data, memory=6 * HEIGHT * WIDTH * 6, order=lambda slabs: iter(slabs[1:]))
+
+
+def test_frames_that_unpack_to_too_much_are_refused(make_zip: Zip, ingest: Ingest) -> None:
+    size = 6 * HEIGHT * WIDTH * 3
+    flat = encode_png(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    archive = make_zip(record([*range(6)]), {f"{n}.png": flat for n in range(6)})
+    with pytest.raises(CaptureError, match=f"6 frames of 37 x 21 pixels take {size} bytes") as caught:
+        ingest("c", archive, unpacked=size - 1)
+    assert caught.value.fields == {"entry": "capture.json", "field": "frames", "limit": size - 1}
+
+
+def test_files_that_interrupted_workers_left_are_removed(make_zip: Zip, ingest: Ingest, folder: Path) -> None:
+    def leave(tiles: range) -> Iterator[int]:
+        (folder / "captures/c/left#1").write_bytes(b"half a chunk")
+        return iter(tiles)
+
+    frames = {f"{n}.png": encode_png(np.full((HEIGHT, WIDTH, 3), 40 * n, np.uint8)) for n in range(6)}
+    ingest("c", make_zip(record([*range(6)]), frames), order=leave)
+    assert not (folder / "captures/c/left#1").exists()
 
 
 @pytest.mark.parametrize(

@@ -81,6 +81,16 @@ def test_float_frames_are_stored_in_units_of_the_white_frame(
     assert stack.attributes["assumed_curves"] == []
 
 
+def test_white_that_was_exposed_longest_is_full_scale(make_zip: Zip, ingest: Ingest) -> None:
+    frames, given = light(1.0), record("exr")
+    given["program"]["parts"][0]["levels"] = [1, 0, 0.5]
+    frames[:3] = frames[[2, 0, 1]]
+    given["frames"].append({"file": "6.exr", "pattern": 0, "exposure": 4})
+    files = {f"{n}.exr": exr(f) for n, f in enumerate([*frames, 4 * frames[0]])}
+    stack = ingest("c", make_zip(given, files))
+    assert stack.attributes["storage"]["full"] == pytest.approx(1.05 * 4 * frames[0].max())
+
+
 def test_nan_and_values_out_of_range_are_clipped(make_zip: Zip, ingest: Ingest) -> None:
     frames = light(1.0)
     frames[2, 5, 5] = 1e6  # a glint does not set the scale
