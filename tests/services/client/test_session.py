@@ -9,6 +9,7 @@ from http.server import BaseHTTPRequestHandler
 import pytest
 
 from services.client import Busy, Client, ServiceError, Unreachable
+from services.client._transport import FIRST_PAUSE, LONGEST_PAUSE
 from tests.services.client.servers import Answer, ok, refusal, scripted_server, web_server
 
 
@@ -109,6 +110,23 @@ def test_unsafe_request_is_not_retried() -> None:
         with pytest.raises(Unreachable):
             client._http.json("POST", "/v1/jobs/j/retry")
     assert len(calls) == 2
+
+
+def test_unsafe_request_that_was_refused_is_retried() -> None:
+    with scripted_server(lambda n: refusal(429) if n == 0 else ok()) as (url, calls), Client(url) as client:
+        client._http.json("POST", "/v1/jobs/j/retry")
+    assert len(calls) == 2
+
+
+def test_pauses_grow_with_each_attempt(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+    monkeypatch.setattr(time, "sleep", waits.append)
+    with scripted_server(lambda n: refusal(429) if n < 8 else ok()) as (url, _), Client(url) as client:
+        client.job("j")
+    for n, wait in enumerate(waits):
+        longest = min(FIRST_PAUSE * 2**n, LONGEST_PAUSE)
+        assert longest / 2 <= wait <= longest
+    assert len(waits) == 8
 
 
 @pytest.mark.parametrize("status", [429, 503])

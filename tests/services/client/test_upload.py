@@ -1,0 +1,61 @@
+"""An upload over a bad line: to a web server that takes no large request."""
+
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from services.client import _upload
+from services.client._transport import PATIENCE, Transport
+from tests.services.client.servers import web_server
+
+MOST = 64 << 10
+"""Bytes of a request that come through."""
+
+
+def test_requests_get_smaller_until_they_come_through_and_larger_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    come = bytearray()
+    sizes: list[int] = []
+
+    class Line(BaseHTTPRequestHandler):
+        def do(self) -> None:
+            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            status = 200
+            if self.command == "PATCH":
+                sizes.append(len(body))
+                status = 503 if len(body) > MOST else 200
+                if status == 200:
+                    come.extend(body)
+            answer = b'{"id": "u"}' if self.path == "/v1/captures" else b""
+            self.send_response(status)
+            for name, value in (("Upload-Offset", len(come)), ("Content-Length", len(answer))):
+                self.send_header(name, str(value))
+            self.send_header("Location", "/v1/uploads/u")
+            self.end_headers()
+            self.wfile.write(answer)
+
+        do_POST = do_HEAD = do_PATCH = do
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    def now() -> float:
+        return len(sizes) * PATIENCE / 4  # each request takes so long: all of them far more than the patience
+
+    waits: list[float] = []
+    monkeypatch.setattr(_upload, "time", SimpleNamespace(monotonic=now, sleep=waits.append))
+    monkeypatch.setattr(_upload, "LARGEST", 4 * MOST)
+    monkeypatch.setattr(_upload, "SMALLEST", MOST // 2)
+    data = bytes(range(256)) * (5 * MOST // 256)
+    (tmp_path / "ball.zip").write_bytes(data)
+    with web_server(Line) as url:
+        http = Transport(url, None)
+        assert _upload.send(http, tmp_path / "ball.zip", {}, None) == {"id": "u"}
+        http.close()
+    assert come == data
+    fails, comes = 2 * MOST, MOST
+    assert sizes == [2 * fails, fails, *3 * [comes, fails], comes, comes]
+    assert waits[1] > waits[0] == waits[2]
