@@ -55,7 +55,7 @@ class Shares:
         self._taken: Counter[str] = Counter()
         self._waiting: list[_Turn] = []
         self._turns: dict[str, int] = {}
-        """The number of the last turn of each owner who has something, or waits."""
+        """The number of the last turn of each owner."""
         self._numbers = count(1)
 
     @asynccontextmanager
@@ -110,8 +110,6 @@ class Shares:
         self._admit()
 
     def _admit(self) -> None:
-        waiting = {turn.owner for turn in self._waiting}
-        self._turns = {one: turn for one, turn in self._turns.items() if one in waiting or self._taken[one]}
         while eligible := [
             turn for turn in self._waiting if self._taken[turn.owner] + turn.amount <= self.each
         ]:

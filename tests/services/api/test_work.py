@@ -182,3 +182,32 @@ def test_turn_that_is_given_up_takes_nothing() -> None:
             pass
 
     asyncio.run(give_up())
+
+
+def test_turn_that_is_given_up_lets_those_pass_that_waited_behind_it() -> None:
+    async def give_up() -> None:
+        shares = Shares(3, 3)
+        async with shares.take("alice", SECONDS):
+            large = asyncio.create_task(_taken(shares, "bob", 3))
+            await asyncio.sleep(0)
+            small = asyncio.create_task(_taken(shares, "carol", 1))
+            await asyncio.sleep(0)
+            large.cancel()
+            await asyncio.wait_for(small, SECONDS / 2)
+
+    asyncio.run(give_up())
+
+
+async def _taken(shares: Shares, owner: str, amount: int) -> None:
+    async with shares.take(owner, SECONDS, amount):
+        pass
+
+
+def test_what_is_kept_counts_for_its_owner_and_for_all() -> None:
+    shares = Shares(4, 2)
+    release = [shares.keep(owner, 2) for owner in ("alice", "bob")]
+    assert not any(shares.exceeded(owner) for owner in ("alice", "bob", "carol"))
+    release.append(shares.keep("alice", 1))
+    assert all(shares.exceeded(owner) for owner in ("alice", "bob", "carol"))  # more than there is
+    release[1]()
+    assert [shares.exceeded(owner) for owner in ("alice", "bob", "carol")] == [True, False, False]
