@@ -97,6 +97,22 @@ def test_second_matte_gives_the_rays(
     assert moved > still + 10
 
 
+def test_pixels_that_see_other_light_in_the_second_matte_follow_the_others() -> None:
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32) / WIDTH
+    plane = np.stack([0.2 + 0.5 * x, 0.1 + 0.6 * y], axis=2)
+    slope = np.stack([0.05 * y, -0.04 * x], axis=2)
+    sure = np.ones((HEIGHT, WIDTH, 2), np.float32)
+    first, second = (np.concatenate([plane + at * slope, sure], axis=2) for at in (NEAR, FAR))
+    second[10:14, 20:30, :2] += 5  # a reflection
+    rays = from_two(first, second, (NEAR, FAR), BEYOND)
+    assert rays.scale == pytest.approx(BEYOND / NEAR)
+    np.testing.assert_allclose(rays.shift, plane * (1 - rays.scale), atol=1e-4)
+    second[..., 3] = 0
+    second[:3, :5, 3] = 1
+    with pytest.raises(Conflict, match="too few pixels"):
+        from_two(first, second, (NEAR, FAR), BEYOND)
+
+
 def test_one_matte_gives_the_rays_by_the_camera_s_lines_of_sight(
     made: dict[float, Matte], scenes: dict[float, Scene], backdrop: np.ndarray
 ) -> None:

@@ -117,6 +117,12 @@ def test_upload_whose_bytes_are_gone_is_started_again(
     assert answer.status_code == 201, answer.text
 
 
+def test_empty_body_leaves_no_object(client: TestClient, objects: Objects) -> None:
+    where = create(client, 5)
+    assert client.patch(where, headers=CHUNK, content=b"").status_code == 204
+    assert (offset_of(client, where), objects.paths_below("uploads")) == ("0", set())
+
+
 def test_empty_key_creates_in_any_case(client: TestClient) -> None:
     headers = TUS | {"Upload-Length": "5", "Idempotency-Key": ""}
     answers = [client.post("/v1/uploads", headers=headers) for _ in range(2)]

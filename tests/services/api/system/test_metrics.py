@@ -101,6 +101,9 @@ def test_queue_counts_tiles_and_measures_their_pace(client: TestClient, engine: 
         values = {"paced_at": time.time() - 10, "paced_done": 1, "moved_at": time.time() - 2}
         c.execute(update(tables.jobs).where(tables.jobs.c.id == job).values(values))
     assert client.get("/v1/cluster").json()["queue"]["tiles_per_second"] == pytest.approx(0.5, rel=0.05)
+    with writing(engine) as c:  # its last step does no tiles
+        c.execute(update(tables.jobs).where(tables.jobs.c.id == job).values(done=tables.jobs.c.total))
+    assert client.get("/v1/cluster").json()["queue"]["tiles_per_second"] is None
 
 
 def test_few_queries_and_none_scans_all_tiles(client: TestClient, engine: Engine, job: str) -> None:
