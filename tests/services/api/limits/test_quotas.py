@@ -157,6 +157,12 @@ def test_jobs_of_an_owner(serve: Serve, archive: bytes, engine: Engine) -> None:
     refused(answer, 429, "owner_jobs", 2, 3)
     assert int(answer.headers["retry-after"]) > 0
     refused(client.post("/v1/captures", content=archive, headers=ZIP), 429, "owner_jobs", 2, 3)
+    where = create(client, len(archive)).headers["location"]
+    chunk = TUS | {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
+    assert client.patch(where, content=archive, headers=chunk).status_code == 204
+    body = {"upload": where.rsplit("/", 1)[1]}
+    refused(client.post("/v1/captures", json=body), 429, "owner_jobs", 2, 3)
+    assert client.head(where, headers=TUS).status_code == 200  # it may become one later
     with writing(for_owner(engine, "alice")) as c:
         mattes.add_imported(c, "m", {}, {})
     video = {"Content-Type": "video/mp4"}
@@ -301,6 +307,7 @@ def test_frames_of_a_capture(serve: Serve, archive: bytes, tmp_path: Path) -> No
     body = {"upload": where.rsplit("/", 1)[1]}
     refused(client.post("/v1/captures", json=body), 413, "capture_frames", 17, 18)
     assert files(tmp_path) == []  # it would be refused again
+    assert used(client)["owner_captures"] == 0
     assert serve(capture_frames=18).post("/v1/captures", content=archive, headers=ZIP).status_code == 201
 
 
