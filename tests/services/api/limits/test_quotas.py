@@ -204,6 +204,13 @@ def test_bytes_stored(serve: Serve, archive: bytes, tmp_path: Path, name: str, o
     assert alice.get(f"/v1/captures/{capture}").status_code == 200
 
 
+def test_body_without_a_length_takes_what_room_there_is(serve: Serve, archive: bytes) -> None:
+    made = serve().post("/v1/captures", content=archive, headers=ZIP)
+    client = serve(owner_bytes=2 * (len(archive) + rows_of(made)))  # far less than a whole step more
+    assert client.post("/v1/captures", content=iter([archive]), headers=ZIP).status_code == 201
+    assert create(client, 1).status_code == 507
+
+
 def test_promises_of_others_keep_at_most_half_and_decay(serve: Serve, engine: Engine) -> None:
     limit = 1_000_000
     alice, bob = (serve(owner, store_bytes=limit) for owner in ("alice", "bob"))
@@ -284,8 +291,8 @@ def test_pauses_count_as_stored(serve: Serve, archive: bytes, engine: Engine) ->
     def pause(paused: bool) -> Any:
         return client.patch(f"/v1/jobs/{job}", json={"paused": paused})
 
-    answers = [pause(paused).status_code for paused in (True, True, False, True, False)]
-    assert answers == [200] * 5
+    answers = [pause(paused).status_code for paused in (True, True, False, True, True, False)]
+    assert answers == [200] * 6
     assert used(client)["owner_bytes"] == before + 2 * PAUSE
     refused(pause(True), 507, "owner_bytes", before + PAUSE, before + 2 * PAUSE)
     plan = {"tiles": 5, "memory": 1}
