@@ -3,7 +3,7 @@
 import os
 import signal
 import sys
-from multiprocessing import forkserver, resource_tracker
+from multiprocessing import forkserver, popen_forkserver, resource_tracker
 
 import dask
 from distributed.utils import get_mp_context
@@ -39,17 +39,19 @@ def start_forkserver(*modules: str) -> None:
             f"processes can't share locks here: {error.strerror}. Mount a tmpfs that this user may write to on /dev/shm"
         ) from error
     get_mp_context().set_forkserver_preload([*modules])  # replaces what distributed has set
+    popen_forkserver.Popen.terminate = popen_forkserver.Popen.kill  # type: ignore[method-assign]  # SIGTERM is blocked
     ensure_running()
 
 
 def ensure_running() -> None:
     """Start the fork server again if it has died, and the resource tracker too.
 
-    A terminal sends Ctrl-C to all processes of a command. It is for the one that started these, which ends them in
-    order: the fork server and all workers inherit that it is blocked, from their first moment on.
+    A terminal sends Ctrl-C to all processes of a command, and systemd or SLURM SIGTERM to all of a service. It is for
+    the one that started these, which ends them in order: the fork server and all workers inherit that both are blocked,
+    from their first moment on.
     """
-    resource_tracker.ensure_running()  # it unblocks the signal where it starts
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    resource_tracker.ensure_running()  # it unblocks the signals where it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM])
     try:
         forkserver.ensure_running()
     finally:

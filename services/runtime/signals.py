@@ -55,12 +55,17 @@ def exit_on_signal() -> None:
 
 @contextmanager
 def held_signals() -> Iterator[None]:
-    """Put a first SIGTERM or SIGINT off until what starts here has started: half of it could not be closed in order."""
+    """Put a first SIGTERM or SIGINT off until what starts here has started: half of it could not be closed in order.
+
+    What takes too long is killed, see `end_in_time`.
+    """
     held: list[int] = []
 
     def hold(number: int, frame: object) -> None:
         if held:
             handlers[number](number, frame)
+        else:
+            end_in_time()
         held.append(number)
 
     handlers: dict[int, Any] = {

@@ -120,7 +120,9 @@ def _variables(names: tuple[str, ...]) -> dict[str, str]:
 
 def main(modules: list[str]) -> None:
     """Import modules, and fork decoders on request until the socket that is standard input is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Sent to all processes of a service, they are for the one that started this, which ends it.
+    for ignored in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ignored, signal.SIG_IGN)
     for module in modules:
         import_module(module)
     load_kernel()  # here it may still be compiled and cached

@@ -6,11 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
 from tests.parts.processes import running
 from tests.parts.waiting import until
-from tests.services.cluster.clusters import workers
+from tests.services.cluster.clusters import children, workers
 
 INSTALLED = "import sys; del sys.path[0]; from services.cli.main import run; run()"
 """Runs the command as its script does, for which the working directory is not on the path."""
@@ -67,3 +68,29 @@ def test_ctrl_c_in_a_terminal_ends_a_service_without_tracebacks(tmp_path: Path, 
         os.killpg(process.pid, signal.SIGINT)
         _, log = process.communicate(timeout=120)
     assert (process.returncode, "Interrupted." in log, "Traceback" in log) == (130, True, False), log
+
+
+def test_sigterm_to_all_processes_of_a_service_is_for_the_one_that_started_them(tmp_path: Path) -> None:
+    options = ["--data", str(tmp_path), "--port", "0", "--workers", "1"]
+    serve = [sys.executable, "-m", "services", "serve", *options]
+    with running(serve, start_new_session=True) as process:
+        assert process.stdout is not None
+        assert " at http" in process.stdout.readline()
+        family = [one for one in children(process) if "decoder_server" not in str(one.cmdline())]
+        for one in family:
+            one.terminate()
+        _, alive = psutil.wait_procs(family, timeout=1)
+        assert set(alive) == set(family)
+        process.terminate()
+        _, log = process.communicate(timeout=120)
+    assert (process.returncode, "Restarting worker" in log, "Traceback" in log) == (0, False, False), log
+
+
+def test_a_process_of_the_fork_server_can_be_terminated() -> None:
+    code = "import time; from services.cluster.dask_config import configure_dask; configure_dask()\n"
+    code += "from services.cluster.forkserver import get_mp_context, start_forkserver; start_forkserver()\n"
+    code += "process = get_mp_context().Process(target=time.sleep, args=(600,)); process.start()\n"
+    code += "process.terminate(); process.join(60); print(process.exitcode)"
+    with running([sys.executable, "-c", code]) as process:
+        out, log = process.communicate(timeout=120)
+    assert out == f"{-signal.SIGKILL}\n", log

@@ -28,6 +28,12 @@ try:
 finally:
     time.sleep(600)
 """,
+    "a process that starts something": """
+signals.exit_on_signal()
+with signals.held_signals():
+    print(child.pid, flush=True)
+    time.sleep(600)
+""",
     "a process with an event loop": """
 @asynccontextmanager
 async def service():

@@ -128,5 +128,6 @@ def read_back(file: BinaryIO) -> Iterator[Any]:
         end = max(end - size, 0)
         file.seek(end)
         pieces.append(file.read(size))
-    yield {"signal": signal.getsignal(signal.SIGINT) == signal.SIG_IGN}
+    ignored = [number for number in signal.Signals if signal.getsignal(number) == signal.SIG_IGN]
+    yield {"ignored": [number.name for number in ignored]}
     yield np.frombuffer(b"".join(pieces), np.uint8)

@@ -80,7 +80,7 @@ def test_file_is_read_piece_by_piece_as_it_is_needed() -> None:
     with Decoder(IMAGE) as found:
         for file in (data, io.BytesIO(data)):
             fields, pixels = found.run(taken_over.read_back, file)
-            assert fields == {"signal": True}
+            assert {"SIGINT", "SIGTERM"} <= set(fields["ignored"])  # they are for the service
             end, pieces = len(data), b""
             for size in (1, 70_000, 3, 300_001):
                 end -= size
