@@ -34,6 +34,8 @@ PATIENCE = 0.5
 """Seconds that a task may continue after it was cancelled."""
 ANSWER = 0.5
 """Seconds that the scheduler has to answer."""
+ENDING = (Status.closing, Status.closed)
+"""States of a worker that is stopped."""
 NICE = 10
 """Niceness of workers: a job takes minutes, while composites and other users of the machine should not wait."""
 
@@ -45,8 +47,13 @@ def dask_setup(worker: Worker) -> None:
     limit_arenas()
     keep_memory()
     configure_worker_logging()
-    # dask logs what a task raised, and `services.cluster.task` has done so.
-    logging.getLogger("distributed.worker").addFilter(lambda record: "Compute Failed" not in str(record.msg))
+
+    def is_news(record: logging.LogRecord) -> bool:
+        # `services.cluster.task` has logged what a task raised, and a worker that is stopped loses what it had.
+        return "Compute Failed" not in str(record.msg) and worker.status not in ENDING
+
+    for name in ("distributed.worker", "distributed.worker.state_machine"):
+        logging.getLogger(name).addFilter(is_news)
     tracing.start("worker")
     lacking = confinement.missing()
     worker.metrics["unconfined_decoders"] = lambda _: lacking  # sent with every heartbeat
@@ -56,7 +63,7 @@ def dask_setup(worker: Worker) -> None:
 
     async def end_strays() -> None:
         now = time.monotonic()
-        ending = worker.status in (Status.closing, Status.closed)
+        ending = worker.status in ENDING
         strays = {task.key for task in worker.state.executing if ending or task.state == "cancelled"}
         for key in since.keys() - strays:
             del since[key]
@@ -71,6 +78,11 @@ def dask_setup(worker: Worker) -> None:
 
     # Not one of the worker's own callbacks, which stop when it begins to close.
     PeriodicCallback(end_strays, 1000 * LOOK).start()
+
+
+async def dask_teardown(worker: Worker) -> None:
+    """Give back the task of a worker that is stopped: otherwise it would count as one that killed its worker."""
+    await _leave(worker)
 
 
 async def _leave(worker: Worker) -> None:
