@@ -58,6 +58,7 @@ def recognise(engine: Engine, objects: Objects, *, mark: bool = True) -> str | N
                 id = marked or new_id()
                 marker.write(objects, id)
                 c.execute(insert(installation).values(id=id))
+    objects.installation = id
     try:
         marker.require(objects, id)
     except WrongStore:

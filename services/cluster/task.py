@@ -80,7 +80,7 @@ def _run(
     name = f"{steps.kind} {NAMES.get(tile, 'tile')}"
     with about(task.job, tile), tracing.span(name, trace, job=task.job, kind=steps.kind, **attributes):
         try:
-            seconds, result = jobs.run(steps, _objects(store, installation), task, tile)
+            seconds, result = _run_in_store(steps, _objects(store, installation), task, tile)
         except EnvmatteError as error:
             if not isinstance(error, InvalidInput):  # the caller's fault is for the job to tell
                 # With a full disk, or without a store, every tile fails, and the text says why.
@@ -98,14 +98,27 @@ def _run(
         return seconds, result
 
 
+def _run_in_store(steps: Steps, objects: Objects, task: Task, tile: int) -> tuple[float, Any]:
+    """Run a step; what it read or wrote does not count if the store's folder was unmounted meanwhile."""
+    marker.require_mounted(objects, _machine())
+    try:
+        return jobs.run(steps, objects, task, tile)
+    finally:
+        marker.require_mounted(objects, _machine())
+
+
 @lru_cache(maxsize=1)
 def _objects(url: str, installation: str | None) -> Objects:
     """The object store of this worker process, once it is found to be the installation's."""
-    machine = f"the worker on {socket.gethostname()}"
     try:
         objects = Objects(url)
     except StoreUnavailable as error:  # its folder can't be made: that of other workers may be there
-        raise WrongStore(f"{machine}: {error.detail}") from error
+        raise WrongStore(f"{_machine()}: {error.detail}") from error
     if installation is not None:
-        marker.require(objects, installation, machine)
+        marker.require(objects, installation, _machine())
+        objects.installation = installation
     return objects
+
+
+def _machine() -> str:
+    return f"the worker on {socket.gethostname()}"

@@ -13,6 +13,7 @@ from storage.database.engine import reading, writing
 from storage.layout import captures, composites, mattes
 from storage.layout import uploads as stored_uploads
 from storage.maintenance import inventory
+from storage.objects import marker
 from storage.objects.store import Objects
 from storage.records import bodies, jobs, links, uploads
 
@@ -87,6 +88,7 @@ def remove(objects: Objects, path: str) -> None:
 
 def count_bytes(engine: Engine, objects: Objects) -> None:
     """Record how many bytes new captures, mattes and videos have in the store; quotas use these numbers."""
+    marker.require_mounted(objects)
     for table, is_complete, folders in (
         (tables.captures, tables.captures.c.state != "ingesting", (captures.path, stored_uploads.path)),
         (tables.mattes, tables.mattes.c.state != "recovering", (mattes.path,)),
@@ -124,6 +126,7 @@ def sweep(engine: Engine, objects: Objects, before: float) -> None:
     before : float
         By the store's clock, see `Objects.clock`. What was written later may be about to get a row.
     """
+    marker.require_mounted(objects)  # in place of its folder, that of another installation may be mounted
     for folder in inventory.FOLDERS:
         names = iter(objects.names(folder))
         while some := list(islice(names, MOST)):

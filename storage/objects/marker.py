@@ -26,6 +26,19 @@ def write(objects: Objects, installation: str) -> None:
     objects.write_raw(PATH, [installation.encode()])
 
 
+def require_mounted(objects: Objects, machine: str = "this machine") -> None:
+    """Check that a folder is still that of the installation, if that is known: a share may be unmounted at any time.
+
+    A bucket is not asked: one that is away says so.
+
+    Raises
+    ------
+    WrongStore
+    """
+    if objects.installation is not None and objects.url.startswith("file:"):
+        require(objects, objects.installation, machine)
+
+
 def require(objects: Objects, installation: str, machine: str = "this machine") -> None:
     """Check that a store belongs to an installation.
 

@@ -67,6 +67,8 @@ class Objects:
     def __init__(self, url: str, key: str | None = None) -> None:
         checksums.configure_zarr()
         self.url = url
+        self.installation: str | None = None
+        """What the store is recognised by once it has been found to be right, see `storage.objects.marker`."""
         self._store: ObjectStore
         self._folder: Path | None = None
         if url.startswith("file:"):

@@ -12,7 +12,8 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import Match, Mount
 
 from services.runtime.problems import MEDIA_TYPE, CodedBody, Unauthorized, problem_detail, problem_of
-from storage.errors import EnvmatteError, InvalidInput, TooMany, Unavailable
+from storage.errors import Corrupt, EnvmatteError, InvalidInput, StoreUnavailable, TooMany, Unavailable
+from storage.objects import marker
 from workflows.untrusted.validation import field_and_reason
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -60,6 +61,11 @@ def register(app: FastAPI) -> None:
 
     @app.exception_handler(EnvmatteError)
     async def _ours(request: Request, error: EnvmatteError) -> JSONResponse:
+        if isinstance(error, Corrupt):
+            try:
+                marker.require_mounted(request.app.state.context.objects)
+            except StoreUnavailable as away:  # nothing is missing
+                error = away
         base = next((base for base in type(error).__mro__ if base in HEADERS), type(error))
         return answer(problem_of(error), HEADERS.get(base))
 

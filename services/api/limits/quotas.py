@@ -10,6 +10,7 @@ from storage import statistics
 from storage.database.disk_reserve import file_of
 from storage.disks import require_reserve
 from storage.errors import NEARLY_FULL, NoRoom, TooMany
+from storage.objects import marker
 from storage.objects.store import Objects
 
 Unit = Literal["bytes", "frames", "pixels", "captures", "jobs", "seconds"]
@@ -212,5 +213,6 @@ def _room_of_service(connection: Connection, settings: Settings) -> int | None:
 
 def _room_on_disk(connection: Connection, objects: Objects) -> int | None:
     """Bytes of the disk that uploads may take, without those that bodies under way have reserved."""
+    marker.require_mounted(objects)
     spare = objects.spare_bytes()
     return None if spare is None else spare - statistics.coming_bytes(connection)

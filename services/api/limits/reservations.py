@@ -11,6 +11,7 @@ from services.api.context import Context
 from services.api.limits.quotas import admit_bytes, admit_upload
 from storage.database.engine import reading, writing
 from storage.errors import NEARLY_FULL, Conflict, NoRoom, Unavailable
+from storage.objects import marker
 from storage.records import bodies
 
 STEP = 8 << 20
@@ -115,6 +116,7 @@ class Reservation:
 
     def _look_at_disk(self) -> None:
         self._looked_at = self._come
+        marker.require_mounted(self._context.objects)
         spare = self._context.objects.spare_bytes()
         if spare is not None and spare < 0:  # something else has filled it
             raise NoRoom(NEARLY_FULL)

@@ -93,8 +93,6 @@ def checks(engine: Engine, objects: Objects) -> dict[str, Check]:
     Coordinators write their heartbeat to the database all the time, so a database that takes no writes is seen by it.
     """
 
-    id: str | None = None
-
     def last_heartbeat() -> Heartbeat | None:
         with reading(engine) as c:
             return leases.last_heartbeat(c)
@@ -106,16 +104,15 @@ def checks(engine: Engine, objects: Objects) -> dict[str, Check]:
         return "ok"
 
     def store() -> str:
-        nonlocal id
         objects.check_reachable()
-        if id is None:  # it stays the same; there is none until a coordinator has started
+        if objects.installation is None:  # it stays the same; there is none until a coordinator has started
             with (
                 suppress(Unavailable, SQLAlchemyError),
                 reading(engine) as c,
             ):  # which the database's check tells
-                id = installation.find(c)
-        if id is not None:
-            marker.require(objects, id)
+                objects.installation = installation.find(c)
+        if objects.installation is not None:
+            marker.require(objects, objects.installation)
         objects.require_reserve()
         return "ok"
 

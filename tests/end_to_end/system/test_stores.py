@@ -1,6 +1,7 @@
 """A cluster on a bucket makes the same bytes as a single machine on a folder; a bucket that refuses is named."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,8 @@ from tests.end_to_end.conftest import Service, digests, serving
 from tests.parts.rig import stored
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import address, started
+
+ZIP = {"Content-Type": "application/zip"}
 
 
 @pytest.mark.exhaustive
@@ -66,6 +69,32 @@ def test_an_api_alone_says_where_it_is_and_which_variables_it_does_not_know(tmp_
         assert process.stdout is not None
         assert process.stdout.readline().startswith("envmatte serves at http://127.0.0.1:")
         assert (tmp_path / "log").read_text().count("ignored: ENVMATTE_STROE_BYTES;") == 1
+
+
+@pytest.mark.slow
+def test_a_share_that_is_unmounted_for_a_while_fails_no_job_and_takes_no_upload(
+    capture_archive: Path, tmp_path: Path
+) -> None:
+    share, away = tmp_path / "share", tmp_path / "away"
+    with serving(tmp_path / "data", "--store", share.as_uri(), "--workers", "1") as service:
+        capture = service.client.upload(capture_archive)
+        service.client.wait(capture["job"])
+        job = service.client.recover(capture["id"], tile=16)["id"]
+        until(lambda: service.client.job(job)["tiles"]["done"] > 1)
+        share.rename(away)
+        share.mkdir()
+        frame, body = f"/v1/captures/{capture['id']}/frames/0.png", capture_archive.read_bytes()
+        refused = service.http.get(frame), service.http.post("/v1/captures", content=body, headers=ZIP)
+        for answer in refused:
+            assert (answer.status_code, answer.json()["type"]) == (503, "urn:envmatte:problem:unavailable")
+            assert "does not see the store of this installation" in answer.json()["detail"]
+        until(lambda: service.client.job(job)["waits_for"])
+        assert not (share / "uploads").exists()
+        shutil.rmtree(share)
+        away.rename(share)
+        assert service.client.wait(job)["state"] == "succeeded"
+        assert service.http.get(frame).status_code == 200
+        assert "Traceback" not in service.log()
 
 
 BLINDED = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs none "$0" && exec "$@"')

@@ -59,6 +59,25 @@ def test_a_worker_looks_for_the_store_until_it_sees_it(
     assert worked == [1]
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_step_during_which_the_folder_is_unmounted_does_not_count(
+    fails: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "BLIND", 0)
+    store = tmp_path / "store"
+    marker.write(Objects(store.as_uri()), "this one")
+
+    def work(objects: Objects, task: Task, tile: int) -> int:
+        store.rename(tmp_path / "unmounted")
+        if fails:
+            raise Corrupt("matte none is not in the store")
+        return 1
+
+    task = Task("a", "none", "none", {}, Limits(1 << 30, 1 << 26))
+    with pytest.raises(WrongStore, match=f"the worker on {socket.gethostname()} does not see"):
+        module._run(0, replace(STEPS, work=work), store.as_uri(), task, None, "this one")
+
+
 def test_a_worker_that_cannot_make_the_folder_of_the_store_does_not_see_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,16 +16,18 @@ from services.coordinator.retention import (
     sweep,
     sweep_uploads,
 )
-from storage import statistics
+from storage import installation, statistics
 from storage.database import tables
 from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import for_owner
 from storage.database.rows import ROW
+from storage.errors import WrongStore
 from storage.layout import captures as stored_captures
 from storage.layout import composites
 from storage.layout import mattes as stored_mattes
 from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
+from storage.objects import marker
 from storage.objects.checksums import SUFFIX
 from storage.objects.store import Objects
 from storage.records import bodies, captures, idempotency, jobs, links, mattes, tiles, uploads
@@ -322,3 +324,16 @@ def test_sweep_leaves_what_a_request_has_uploaded(engine: Engine, objects: Objec
     sweep(engine, objects, objects.clock() + 60)
     assert objects.paths_below("uploads") | objects.paths_below("composites") == set()
     assert objects.paths_below("mattes") == {f"{stored_mattes.path('kept')}/z"}
+
+
+def test_sweep_leaves_the_store_of_another_installation(engine: Engine, tmp_path: Path) -> None:
+    """As where its share is mounted in place of the right one."""
+    objects = Objects(tmp_path.as_uri())
+    installation.recognise(engine, objects)
+    marker.write(objects, "another")
+    objects.put(f"{stored_mattes.path('theirs')}/z", b"matte")
+    with pytest.raises(WrongStore):
+        sweep(engine, objects, objects.clock() + 60)
+    with pytest.raises(WrongStore):
+        count_bytes(engine, objects)
+    assert objects.paths_below("mattes") == {f"{stored_mattes.path('theirs')}/z"}
