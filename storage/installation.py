@@ -1,13 +1,17 @@
 """The id of the installation, which its store has too, see `storage.objects.marker`."""
 
-from sqlalchemy import Connection, Engine, insert, select
+from sqlalchemy import Connection, Engine, insert, inspect, select
 
 from storage.database.engine import reading, writing
 from storage.database.rows import new_id
 from storage.database.tables import captures, installation, mattes
 from storage.errors import StoreUnavailable, WrongStore
+from storage.maintenance import inventory
 from storage.objects import marker
 from storage.objects.store import Objects
+
+ENOUGH = 1000
+"""Names of things in the store that are looked up, at most."""
 
 
 def find(connection: Connection) -> str | None:
@@ -34,14 +38,16 @@ def recognise(engine: Engine, objects: Objects, *, mark: bool = True) -> str | N
     Raises
     ------
     WrongStore
-        If the store has another id or none, or is empty while the database has captures or mattes.
+        If the store has another id or none. If there is no id yet: if the store is empty while the database has
+        captures or mattes, or has only things that the database does not know.
     StoreUnavailable
-        If it can't be reached to be marked.
+        If there is no id yet and it can't be reached.
     """
     with reading(engine) as c:
         id = find(c)
         holds = id is None and _holds_anything(c)
     if id is None:
+        _require_known(engine, objects)
         if not mark:
             return None
         # A store that is marked was marked by a start that was interrupted, or its database was restored. Before the
@@ -66,6 +72,36 @@ def recognise(engine: Engine, objects: Objects, *, mark: bool = True) -> str | N
     except StoreUnavailable:
         pass
     return id
+
+
+def require(engine: Engine, objects: Objects) -> None:
+    """Check that a store has the id of its database, which may have the schema of an earlier version.
+
+    Raises
+    ------
+    WrongStore
+    StoreUnavailable
+    """
+    with reading(engine) as c:
+        id = find(c) if inspect(c).has_table(installation.name) else None
+    if id is not None:
+        marker.require(objects, id)
+
+
+def _require_known(engine: Engine, objects: Objects) -> None:
+    """Check that a store with anything in it has something of this database: what it does not know would be removed."""
+    found = False
+    for folder in inventory.FOLDERS:
+        names = objects.names(folder)[:ENOUGH]
+        with reading(engine) as c:
+            if inventory.known_names(c, folder, names):
+                return
+        found |= names not in ([], ["zarr.json"])
+    if found:
+        raise WrongStore(
+            "the store has captures, mattes or uploads, and the database knows none of them: name the database that "
+            "they belong to, or an empty folder or bucket; to start afresh, remove what is in the store"
+        )
 
 
 def _holds_anything(connection: Connection) -> bool:

@@ -36,13 +36,18 @@ def _installation(command: F) -> F:
 def _opened(given: dict[str, Any]) -> Iterator[tuple["Settings", "Engine", "Objects"]]:
     """The database and the store of an existing installation; the schema is not upgraded."""
     from services.settings import Settings
+    from storage import installation
     from storage.maintenance.row_dump import open_without_upgrade
     from storage.objects.store import Objects
 
     settings = Settings(**drop_unset(given))
     engine = open_without_upgrade(settings.database_url)
     try:
-        yield settings, engine, Objects(settings.store_url)
+        objects = Objects(settings.store_url)
+        installation.require(
+            engine, objects
+        )  # otherwise all would be missing, with advice to upload it again
+        yield settings, engine, objects
     finally:
         engine.dispose()
 

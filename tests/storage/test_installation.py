@@ -7,10 +7,11 @@ import pytest
 from sqlalchemy import Engine
 
 from storage import installation
-from storage.database.engine import reading
+from storage.database.engine import reading, writing
 from storage.errors import WrongStore
 from storage.objects import marker
 from storage.objects.store import Objects
+from storage.records import mattes
 from tests.storage.installation import fill
 
 
@@ -66,6 +67,20 @@ def test_an_empty_store_is_not_that_of_a_database_with_captures(
     # An earlier version did not mark its store.
     id = installation.recognise(engine, objects)
     assert marker.read(objects) == id
+
+
+@pytest.mark.parametrize("mark", [True, False])
+def test_a_store_is_not_that_of_a_database_that_knows_nothing_of_it(
+    mark: bool, engine: Engine, objects: Objects
+) -> None:
+    """As when a new service is pointed at the store of another one: its sweep would remove all."""
+    for path in ("mattes/theirs/S/c/0", "installation"):
+        objects.put(path, b"theirs")
+        with pytest.raises(WrongStore, match="the database knows none of them"):
+            installation.recognise(engine, objects, mark=mark)
+    with writing(engine) as c:
+        mattes.add(c, "theirs", "c", "r", {})
+    assert installation.recognise(engine, objects) == "theirs"
 
 
 def test_an_api_alone_marks_no_store(engine: Engine, objects: Objects) -> None:

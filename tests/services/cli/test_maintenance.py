@@ -6,6 +6,9 @@ import pytest
 from click.testing import CliRunner
 
 from services.cli.main import main
+from storage import installation
+from storage.database.engine import open_engine
+from storage.objects.store import Objects
 
 
 @pytest.mark.parametrize(
@@ -26,3 +29,18 @@ def test_invalid_arguments_are_reported(
     assert reason in " ".join(done.stderr.split())
     assert done.stdout == ""
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("command", [("verify",), ("backup", "target")])
+def test_a_store_that_is_not_mounted_is_named_rather_than_all_that_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    engine = open_engine("sqlite:///envmatte.db")
+    installation.recognise(engine, Objects((tmp_path / "store").as_uri()))
+    engine.dispose()
+    place = ("--data", str(tmp_path), "--store", (tmp_path / "unmounted").as_uri())
+    done = CliRunner().invoke(main, (*command, *place))
+    assert done.exit_code == 1
+    assert "does not see the store of this installation" in done.stderr
+    assert done.stdout == ""
