@@ -7,6 +7,7 @@ takes longer to import than all that command does.
 import os
 from collections.abc import Container
 from pathlib import Path
+from urllib.parse import quote
 
 PREFIX = "ENVMATTE_"
 FILE = Path(".env")
@@ -46,4 +47,4 @@ def _all() -> dict[str, str]:
 
 def database_url(data: Path, database: str | None) -> str:
     """Where the database is, as SQLAlchemy takes it: as named, or in the data folder."""
-    return database or f"sqlite:///{data.resolve() / 'envmatte.db'}"
+    return database or f"sqlite:///{quote(str(data.resolve() / 'envmatte.db'))}"

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from services.runtime.environment import database_url, read_environment, unknown_variables
+from storage.database.engine import open_engine
 
 NAMES = {"port", "worker_memory"}
 
@@ -46,3 +47,11 @@ def test_what_is_no_setting_is_found_in_variables_and_file(monkeypatch: pytest.M
 def test_the_database_is_in_the_data_folder_unless_named(tmp_path: Path) -> None:
     assert database_url(Path("data"), None) == f"sqlite:///{tmp_path}/data/envmatte.db"
     assert database_url(Path("data"), "postgresql://host/name") == "postgresql://host/name"
+
+
+def test_the_database_is_in_a_data_folder_of_any_name(tmp_path: Path) -> None:
+    data = tmp_path / "glass #1 %41?ü"
+    data.mkdir()
+    open_engine(database_url(data, None)).dispose()
+    assert [*tmp_path.iterdir()] == [data]
+    assert (data / "envmatte.db").is_file()
