@@ -22,6 +22,8 @@ from storage.records.leases import Heartbeat
 router = Router(tags=["system"])
 KINDS = ("ingest", "recover", "composite")
 JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
+CAPTURE_STATES = ("ingesting", "ready", "failed")
+MATTE_STATES = ("recovering", "ready", "failed")
 MEDIA_TYPES = ("text/plain", "application/openmetrics-text")
 Labelled = Iterable[tuple[tuple[str, ...], float]]
 
@@ -82,31 +84,38 @@ def _of_the_queue(connection: Connection) -> Iterator[Metric]:
 
 def _of_work(connection: Connection) -> Iterator[Metric]:
     """Work done so far."""
-    rows = {(row.kind,): row for row in statistics.work_totals(connection)}
+    # From 0 on: Prometheus would not see a counter grow that begins with its first event.
+    rows = {row.kind: row for row in statistics.work_totals(connection)}
+
+    def of_kinds(column: str) -> Labelled:
+        return [((kind,), getattr(rows.get(kind), column, 0)) for kind in KINDS]
+
     steps = SummaryMetricFamily(
         "envmatte_tile_seconds", "Seconds that workers spent on finished tiles.", labels=["kind"]
     )
-    for labels, row in rows.items():
-        steps.add_metric(labels, row.tiles, row.seconds)
+    for (labels, tiles), (_, seconds) in zip(of_kinds("tiles"), of_kinds("seconds"), strict=True):
+        steps.add_metric(labels, tiles, seconds)
     yield steps
     for name, column, text in (
         ("pixels", "pixels", "Pixels done: of frames ingested, mattes recovered and frames composited."),
         ("tile_failures", "misses", "Failed attempts at a tile or a step."),
         ("tile_losses", "losses", "Tiles and steps lost with their worker or in the store."),
     ):
-        yield _counter(
-            name, text, ("kind",), {key: getattr(row, column) for key, row in rows.items()}.items()
-        )
+        yield _counter(name, text, ("kind",), of_kinds(column))
 
 
 def _of_data(connection: Connection) -> Iterator[Metric]:
     """Captures, mattes and uploads."""
-    rows = statistics.capture_counts(connection)
-    yield _gauge("captures", "Captures by state.", ("state",), (((r.state,), r.number) for r in rows))
-    text = "Bytes of the uploaded archives of captures."
-    yield _gauge("capture_bytes", text, ("state",), (((r.state,), r.bytes) for r in rows))
+    rows = {row.state: row for row in statistics.capture_counts(connection)}
+    for name, column, text in (
+        ("captures", "number", "Captures by state."),
+        ("capture_bytes", "bytes", "Bytes of the uploaded archives of captures."),
+    ):
+        values = [((state,), getattr(rows.get(state), column, 0)) for state in CAPTURE_STATES]
+        yield _gauge(name, text, ("state",), values)
     found = statistics.matte_counts(connection)
-    yield _gauge("mattes", "Mattes by state.", ("state",), (((k,), n) for k, n in found.items()))
+    values = [((state,), found.get(state, 0)) for state in MATTE_STATES]
+    yield _gauge("mattes", "Mattes by state.", ("state",), values)
     uploads = statistics.upload_counts(connection)
     yield _one("uploads", "Resumable uploads under way.", uploads.number)
     yield _one("upload_bytes", "Bytes that have been uploaded so far.", uploads.come)

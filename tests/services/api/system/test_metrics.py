@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
-from sqlalchemy import Engine, event, update
+from sqlalchemy import Engine, delete, event, update
 
 from services.api.app import build_app
 from services.settings import Settings
@@ -50,6 +50,21 @@ def metrics(client: TestClient) -> dict[tuple[str, ...], float]:
         (sample.name, *(sample.labels[name] for name in sorted(sample.labels))): sample.value
         for family in text_string_to_metric_families(client.get("/metrics").text)
         for sample in family.samples
+    }
+
+
+def test_series_are_there_before_the_first_event(client: TestClient, engine: Engine, job: str) -> None:
+    with writing(engine) as c:
+        for table in (tables.captures, tables.jobs, tables.totals):
+            c.execute(delete(table))
+    found = metrics(client)
+    assert {value for (name, *labels), value in found.items() if labels} == {0}
+    assert found.keys() >= {
+        ("envmatte_captures", "failed"),
+        ("envmatte_capture_bytes", "ready"),
+        ("envmatte_mattes", "ready"),
+        ("envmatte_tile_failures_total", "composite"),
+        ("envmatte_tile_seconds_count", "recover"),
     }
 
 
