@@ -39,7 +39,9 @@ def stack(ingest: Ingest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> St
 
 
 @pytest.mark.parametrize("method", ["lobes", "nn-dgsr"])
-def test_preview_is_there_until_the_matte_is_complete(objects: Objects, stack: Stack, method: str) -> None:
+def test_preview_is_there_until_the_matte_is_complete(
+    objects: Objects, folder: Path, stack: Stack, method: str
+) -> None:
     task = Task("j", "c", "m", {"method": method}, Limits(1 << 30, 1 << 26))
     plan = run(STEPS, objects, task, PREPARE)[1]
     assert plan["figures"]["preview"] == SPACING
@@ -54,7 +56,10 @@ def test_preview_is_there_until_the_matte_is_complete(objects: Objects, stack: S
     whole = composite(mattes.Matte(objects, "m"), backdrop)
     np.testing.assert_array_equal(coarse[..., 3], whole[at][..., 3])
     assert np.sqrt(np.mean((coarse - whole[at])[coarse[..., 3] > 0] ** 2)) < 0.05
+    unfinished = folder / mattes.path("m") / "S/c/0/0/0#1"  # of a worker that was killed
+    unfinished.write_bytes(b"half a chunk")
     assert not run(STEPS, objects, task, FINISH)[1].get("missing")
+    assert not unfinished.exists()
     with pytest.raises(Corrupt):
         mattes.Matte(objects, mattes.preview_of("m"))
     assert not [path for path in objects.paths_below(mattes.path("m")) if "preview" in path]
