@@ -151,7 +151,7 @@ def test_matte_deleted_while_it_is_read_is_an_error_for_all_readers(
 
 
 def test_nothing_is_kept_of_a_matte_that_is_forgotten(objects: Objects, matte: Matte) -> None:
-    cache = Cache(objects, 1 << 20)
+    cache = Cache(objects, 1 << 30)
     cache.strip("m", 0, 0)
     cache.places("m", 1)
     cache.forget("m")

@@ -40,6 +40,8 @@ def cases(attributes: dict[str, Any]) -> list[tuple[dict[str, Any], str, str | N
         return {"auto_exposure": [least, most, *np.ones(frames - 2).tolist()]}
 
     black = surveyed("black", clipped_low=0.4)
+    mapped = {"tone_mapping": {"power": 0.2, "spread": 0.1}}
+    following = steadiness(flicker=FLICKER | {"follows": -0.5})
     return [
         (surveyed("white", clipped_high=0.004), "exposure", "warning", "a third of a stop less"),
         (surveyed("white", clipped_high=0.04), "exposure", "warning", "half a stop less"),
@@ -67,9 +69,10 @@ def cases(attributes: dict[str, Any]) -> list[tuple[dict[str, Any], str, str | N
             "bad",
             "only in part",
         ),
-        (steadiness(flicker=FLICKER | {"follows": -0.5}), "tone_mapping", "warning", "switch HDR"),
-        (steadiness(flicker=FLICKER | {"follows": -0.5}), "flicker", None, ""),
-        ({"tone_mapping": {"power": 0.2, "spread": 0.1}}, "tone_mapping", "warning", "switch HDR"),
+        (following, "tone_mapping", "warning", "switch HDR"),
+        (following, "flicker", None, ""),
+        (following | mapped, "flicker", "warning", "it is not corrected"),
+        (mapped, "tone_mapping", "warning", "switch HDR"),
         ({"tone_mapping": {"power": 0.05, "spread": 0.1}}, "tone_mapping", "good", ""),
         ({"glare": [0.02, 0.02]}, "glare", "warning", "clean the lens"),
         ({"glare": [0.2, 0.2]}, "glare", "bad", "clean the lens"),
