@@ -100,7 +100,8 @@ def _require_known(engine: Engine, objects: Objects) -> None:
     if found:
         raise WrongStore(
             "the store has captures, mattes or uploads, and the database knows none of them: name the database that "
-            "they belong to, or an empty folder or bucket; to start afresh, remove what is in the store"
+            "they belong to, or an empty folder or bucket. Run an interrupted `envmatte restore` again. To start "
+            "afresh, remove what is in the store"
         )
 
 
