@@ -26,6 +26,12 @@ def start_forkserver(*modules: str) -> None:
     Unavailable
         If processes can't share locks here, which dask needs.
     """
+    try:
+        os.chdir(os.getcwd())
+    except (
+        OSError
+    ):  # it was deleted, or this user may not enter it, as after `sudo -u`; workers want to go there
+        os.chdir("/")
     for name, value in dask.config.get("distributed.nanny.pre-spawn-environ").items():
         os.environ[name] = str(value)  # as nannies do, but before libraries that read it are loaded
     # Workers run the code of this process. Otherwise Python would look in the working directory first, where a clone or

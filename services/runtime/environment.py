@@ -33,7 +33,9 @@ def unknown_variables(names: Container[str]) -> list[str]:
 
 def _all() -> dict[str, str]:
     lines: dict[str, str | None] = {}
-    if FILE.is_file():
+    if os.path.isfile(
+        FILE
+    ):  # not `Path.is_file`, which fails in a working directory that this user may not search
         from dotenv import dotenv_values
 
         lines = dotenv_values(FILE)

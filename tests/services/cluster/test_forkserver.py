@@ -45,6 +45,18 @@ def test_workers_do_not_run_the_code_of_the_working_directory(tmp_path: Path) ->
         process.wait(60)
 
 
+def test_the_working_directory_may_be_gone(tmp_path: Path) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    options = ["--data", str(tmp_path / "data"), "--port", "0", "--workers", "1"]
+    serve = [sys.executable, "-c", f"import os; os.rmdir({str(folder)!r}); {INSTALLED}", "serve", *options]
+    with running(serve, cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}) as process:
+        assert process.stdout is not None
+        assert " at http" in process.stdout.readline()
+        process.terminate()
+        process.wait(60)
+
+
 def test_ctrl_c_while_the_cluster_starts_ends_it_without_tracebacks(tmp_path: Path) -> None:
     options = ["--data", str(tmp_path), "--port", "0", "--workers", "1"]
     with running([sys.executable, "-m", "services", "serve", *options], start_new_session=True) as process:
