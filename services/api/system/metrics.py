@@ -94,7 +94,7 @@ def _of_work(connection: Connection) -> Iterator[Metric]:
         "envmatte_tile_seconds", "Seconds that workers spent on finished tiles.", labels=["kind"]
     )
     for (labels, tiles), (_, seconds) in zip(of_kinds("tiles"), of_kinds("seconds"), strict=True):
-        steps.add_metric(labels, tiles, seconds)
+        steps.add_metric(labels, int(tiles), seconds)
     yield steps
     for name, column, text in (
         ("pixels", "pixels", "Pixels done: of frames ingested, mattes recovered and frames composited."),
