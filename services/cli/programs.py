@@ -142,7 +142,7 @@ def shown_program(file: Path) -> "Program":
 
 def stills_in(folder: Path, program: "Program") -> Sequence[Path]:
     """The stills in a folder, by name; a usage error if they are of several kinds, or more than the patterns."""
-    stills = [path for path in sorted(folder.glob("[!.]*")) if path.is_file()]
+    stills = [path for path in sorted(folder.glob("[!.]*"), key=_by_number) if path.is_file()]
     kinds = sorted({path.suffix.lower() for path in stills})
     if len(kinds) > 1:
         raise click.UsageError(
@@ -151,6 +151,12 @@ def stills_in(folder: Path, program: "Program") -> Sequence[Path]:
     if len(stills) > program.count:
         raise _miscounted(folder, len(stills), program)
     return stills
+
+
+def _by_number(path: Path) -> tuple[list[tuple[int, str]], str]:
+    """Orders names by the numbers in them, as the web app does: 10 comes after 9."""
+    parts = re.split(r"([0-9]+)", path.name.casefold())
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in parts], path.name
 
 
 def _miscounted(folder: Path, files: int, program: "Program") -> click.UsageError:

@@ -91,7 +91,7 @@ def test_films_and_stills_are_packed_with_their_program(tmp_path: Path) -> None:
     film.write_bytes(b"\0\0\0\x14ftypqt  and more")
     stills.mkdir()
     for n in range(shown.count):
-        (stills / f"DSC_{n:04}.NEF").write_bytes(bytes([n]))
+        (stills / f"DSC_{8 + n}.NEF").write_bytes(bytes([n]))  # 10 comes after 9
 
     def pack(*arguments: Path | str) -> tuple[int, str]:
         done = CliRunner().invoke(main, ["pack", *map(str, arguments)])
@@ -109,7 +109,7 @@ def test_films_and_stills_are_packed_with_their_program(tmp_path: Path) -> None:
         for n, frame in enumerate(found["frames"]):
             assert (frame["pattern"], packed.read(frame["file"])) == (n, bytes([n]))
         assert Program.model_validate(found["program"]) == shown
-    (stills / "DSC_0001.NEF").unlink()
+    (stills / "DSC_9.NEF").unlink()
     whole = record.read_text()
     record.write_text(json.dumps(json.loads(whole) | {"video": None}))
     for source, why in (
