@@ -24,6 +24,7 @@ SAYING = [
     "services/api/jobs/wait_reason.py",
     "services/runtime/problems.py",
     "workflows/ingest/report/findings.py",
+    "workflows/ingest/report/frame_findings.py",
     "workflows/ingest/report/limits.py",
     "workflows/ingest/video/missing_patterns.py",
     "workflows/programs/preset_names.py",

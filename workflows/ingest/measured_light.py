@@ -89,6 +89,18 @@ def exposures_of(attributes: dict[str, Any]) -> Floats:
     return exposures
 
 
+def odd_frames(attributes: dict[str, Any]) -> list[int]:
+    """The frames of a stack that do not show their patterns, as `workflows.ingest.trial.frame_order` has found."""
+    found: list[int] = attributes.get("odd_frames", [])  # missing from captures of earlier versions
+    return found
+
+
+def patterns_seen(attributes: dict[str, Any]) -> list[int]:
+    """The patterns of a stack's frames, in order, without those of odd ones."""
+    odd = set(odd_frames(attributes))
+    return [pattern for frame, pattern in enumerate(attributes["patterns"]) if frame not in odd]
+
+
 def read_light(
     stack: Stack,
     span: tuple[slice, slice],
@@ -202,8 +214,10 @@ def merge(
     every, times = np.zeros(shape, np.float32), np.zeros(count, np.float32)
     gain, mean_gain = np.zeros(shape if gains else (0, 0, 0), np.float32), np.zeros(count, np.float32)
     of_exposure: dict[tuple[int, float], list[int]] = {}
+    odd = set(odd_frames(attributes))
     for frame, key in enumerate(zip(attributes["patterns"], exposures.tolist(), strict=True)):
-        of_exposure.setdefault(key, []).append(frame)
+        if frame not in odd:
+            of_exposure.setdefault(key, []).append(frame)
     for (pattern, exposure), frames in of_exposure.items():
         total = np.zeros((pixels, 3), np.float32)
         whole = np.ones((pixels, 3), bool)
@@ -298,7 +312,7 @@ def measure(
         values[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
     )
     shown = program.measured
-    filmed = np.isin(shown, attributes["patterns"])
+    filmed = np.isin(shown, patterns_seen(attributes))
     bounded = bound_clipped(values[:, shown], usable[:, shown], worth[:, shown], filmed, photometry, noise)
     return Observations(photometry, *bounded)
 

@@ -21,6 +21,7 @@ from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import measure
 from workflows.ingest.manifest import MANIFEST, Manifest, Video
 from workflows.ingest.report.survey import survey
+from workflows.ingest.trial.frame_order import check_frames
 from workflows.ingest.trial.qualities import try_qualities
 from workflows.ingest.trial.steadiness import find_steadiness
 from workflows.ingest.trial.trial_recovery import take_sample
@@ -258,6 +259,7 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
     objects.sweep(captures.path(task.capture))
     stack = Stack(objects, task.capture)
     border = BorderValues.of(stack)
+    check_frames(stack)
     measure(stack, border)
     seconds = _try_out(stack, border)
     survey(stack, border)

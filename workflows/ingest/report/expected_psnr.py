@@ -51,8 +51,8 @@ def expected(
     Returns
     -------
     Quality or None
-        None if no pixel sees light, if random patterns are still to be shown, or if the program has none and its
-        patterns could not be recovered on trial.
+        None if white is within the noise of black, if random patterns are still to be shown, or if the program has none
+        and its patterns could not be recovered on trial.
 
     Notes
     -----
@@ -97,7 +97,7 @@ def expected(
     if rho > 0 and pattern_error and not any(isinstance(part, Bernoulli) for part in program.parts):
         low, high = (-20 * log10(pattern_error) - worse for worse in _OTHER)
         return Quality(low=low, high=high, blocks=None)
-    if rho <= 0 or not random:
+    if rho <= survey["deviation"] or not random:
         return None
     fixed = not any(part.offset for part in random)
     measured = sum(count for part, count in shown if fixed or not isinstance(part, Bernoulli) or part.offset)

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from workflows.ingest.measured_light import patterns_seen
 from workflows.ingest.report.expected_psnr import costs_of, error_of
 from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
+from workflows.ingest.report.frame_findings import constants, frames, odd_frames, order
 from workflows.ingest.report.limits import (
     curves,
     is_assumed,
@@ -15,7 +17,6 @@ from workflows.ingest.report.limits import (
     unexplained,
     unmeasured,
 )
-from workflows.ingest.video.missing_patterns import by_reason, ranges, remedy
 from workflows.programs.program import Bernoulli, Program
 
 SURE = 4.0
@@ -33,9 +34,14 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     """
     survey = attributes["survey"]
     costs = costs_of(
-        program, attributes["patterns"], survey, error_of(attributes), attributes.get("auto_exposure")
+        program, patterns_seen(attributes), survey, error_of(attributes), attributes.get("auto_exposure")
     )
+    if attributes.get("order"):  # what else would be found means nothing
+        return [order(**attributes["order"]), frames(figures)]
     found = [
+        *odd_frames(attributes.get("odd_frames", [])),
+        # What followed the camera's own exposure is corrected.
+        *constants(None if attributes.get("auto_exposure") else attributes.get("constants_apart")),
         *_exposure(figures, attributes["storage"]),
         *_auto_exposure(attributes.get("auto_exposure"), costs["auto_exposure"]),
         *_tone_mapping(attributes.get("tone_mapping")),
@@ -49,36 +55,11 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *lost_colour(program, costs["lost_colour"], half_colour=attributes.get("half_colour", False)),
         *_noise(figures, attributes, costs["noise"]),
         *_flicker(figures.flicker, mapped=bool(attributes.get("tone_mapping"))),
-        _frames(figures),
+        frames(figures),
         *quality(figures.quality, any(isinstance(part, Bernoulli) for part in program.parts)),
         *unmeasured(figures, program, attributes),
     ]
     return sorted(found, key=lambda one: (-LEVELS.index(one.level), -(one.cost or 0.0)))
-
-
-def _frames(figures: Figures) -> Finding:
-    missing = {int(number): why for number, why in figures.video["missing"].items()} if figures.video else {}
-    if missing:
-        which = "; ".join(f"{ranges(numbers)} ({why})" for numbers, why in by_reason(missing))
-        return Finding(
-            name="frames",
-            level=graded(len(missing) / figures.frames.patterns, 0, 0.1),
-            message=f"{len(missing)} of {figures.frames.patterns} patterns have no frame that can be used: {which}",
-            remedy=remedy(missing.values()),
-        )
-    if figures.frames.missing:
-        return Finding(
-            name="frames",
-            level="good",
-            message=f"{figures.frames.kept} frames of the {figures.frames.patterns - len(figures.frames.missing)} "
-            f"patterns shown so far; the program has {figures.frames.patterns}",
-        )
-    several = f", in {figures.frames.exposures} exposures" if figures.frames.exposures > 1 else ""
-    return Finding(
-        name="frames",
-        level="good",
-        message=f"{figures.frames.kept} frames of all {figures.frames.patterns} patterns{several}",
-    )
 
 
 def _exposure(figures: Figures, storage: dict[str, Any]) -> list[Finding]:
@@ -266,6 +247,16 @@ def _glare(shares: list[float] | None) -> list[Finding]:
 def _noise(figures: Figures, attributes: dict[str, Any], cost: float) -> list[Finding]:
     survey = attributes["survey"]
     ratio = survey["contrast"] / survey["deviation"] if survey["deviation"] else 0.0
+    if ratio <= 1:
+        return [
+            Finding(
+                name="noise",
+                level="bad",
+                message="the white frame is no brighter than the black one: the frames do not see the monitor",
+                remedy="take the cap off the lens, switch the monitor on, and see that it fills the picture behind the "
+                "object",
+            )
+        ]
     level = graded(-ratio, -25, -8)
     if level == "good" and is_assumed(attributes):
         return []

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from workflows.ingest.measured_light import patterns_seen
 from workflows.ingest.report.expected_psnr import error_of, expected
 from workflows.ingest.report.figures import (
     LEVELS,
@@ -75,9 +76,11 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         ),
         crosstalk=attributes["crosstalk"],
         **curves,
-        quality=expected(
+        quality=None
+        if attributes.get("order")
+        else expected(
             program,
-            attributes["patterns"],
+            patterns_seen(attributes),
             survey,
             error_of(attributes),
             attributes.get("pattern_error"),

@@ -22,6 +22,7 @@ from workflows.ingest.measured_light import (
     light_of,
     look_up_of,
     measure,
+    odd_frames,
     unclipped_light,
 )
 from workflows.programs.program import Program
@@ -165,11 +166,11 @@ def see_sample(stack: Stack, sample: PixelSample, shifts: Doubles) -> Seen:
     y, x = y + _SLOPE, x + _SLOPE
     shape = (stack.frames, len(square), stack.channels)
     values, across, down = np.empty((3, *shape), np.float32)
-    whole = np.empty(shape, bool)
+    whole, odd = np.empty(shape, bool), set(odd_frames(stack.attributes))
     for n, (codes, shift) in enumerate(zip(sample.codes, shifts.tolist(), strict=True)):
         picture, unclipped = unclipped_light(codes, shift, _MARGIN - _SLOPE, look_up, clipped_from(stack))
         picture = even_out(picture, n, stack.attributes)
-        values[n], whole[n] = picture[square, y, x], unclipped[square, y, x]
+        values[n], whole[n] = picture[square, y, x], unclipped[square, y, x] & (n not in odd)
         # The slope of the polynomial through five values.
         for slope, (dy, dx) in ((across, (0, 1)), (down, (1, 0))):
             near = picture[square, y + dy, x + dx] - picture[square, y - dy, x - dx]

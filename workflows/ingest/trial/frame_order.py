@@ -1,0 +1,279 @@
+"""Whether each frame shows the pattern that it is said to, told by thumbnails, before anything is recovered."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.layout.captures import Stack, thumbnail_edge
+from workflows.images.resample import area_mean
+from workflows.images.tone_curves import Curve, to_light
+from workflows.ingest.measured_light import exposures_of
+from workflows.ingest.video.resemblance import GRIDS, MIN_PATTERNS, lay_out
+from workflows.programs.program import Bernoulli, Program
+
+PLACES = 400
+"""Blocks of the frame that are compared, at most,"""
+FEW = 80
+"""and where many orders are tried."""
+FEWEST = 30
+"""Blocks that are needed."""
+BRIGHTEST = 0.98
+"""The quantile of blocks that tells how much the brightest see."""
+CHANGES = 0.2
+"""A block sees the monitor if its deviation is more than this share of the most changing blocks'."""
+TYPICAL, SPREAD, BELOW = 0.3, 0.25, 0.6
+"""A frame is odd if it resembles its pattern less than `BELOW` times as much as is typical of its part, by `SPREAD` at
+least, or hardly at all; no frame is in a part of which less than `TYPICAL` is typical."""
+HARDLY, SURE = 0.3, 5.0
+"""Hardly at all is less than this share of it. What is odd is so by this many of the part's standard deviations."""
+MOST_ODD = 0.1
+"""A larger share of odd frames are not single accidents: they stay in, and other orders are tried."""
+BEYOND, COVERED = 0.1, 0.1
+"""A frame is odd, too, if more than `COVERED` of its blocks are outside of black and white by more than `BEYOND` of
+their difference, and those of usual ones are not."""
+SHIFTS = (-3, -2, -1, 1, 2, 3)
+"""Shifts of later frames that are tried: stills that are missing, or that were taken twice."""
+STARTS = 16
+"""Frames from which on shifts are tried at first, spread over the program."""
+MOST = 1000
+"""Frames of captures of which other orders are tried."""
+GAIN, CLEAR = 2.0, 2.0
+"""By how much, in frames that look exactly like their patterns, another order must look more like the program than the
+stated one; and how many times as much as random orders."""
+UNLIKE = 1.5
+"""The stated order must look this many times as much like the program as random orders."""
+ORDERS = 8
+"""Random orders to compare with."""
+APART, WIDESPREAD = 0.1, 0.05
+"""Frames of one constant differ if more than `WIDESPREAD` of the blocks do, by more than `APART` of white."""
+
+Floats = NDArray[np.float32]
+Integers = NDArray[np.intp]
+
+
+class Order(NamedTuple):
+    """How the order of the frames differs from the one that the capture states.
+
+    Attributes
+    ----------
+    kind : str
+        ``reversed``; ``rolled``: the first frame shows pattern ``by``, as where names are counted on from 9999 to 1;
+        ``shifted``: from frame ``first`` on each shows the pattern ``by`` after its own; ``unlike``: no frame shows its
+        pattern.
+    """
+
+    kind: Literal["reversed", "rolled", "shifted", "unlike"]
+    first: int = 0
+    by: int = 0
+
+    def of(self, patterns: Integers) -> Integers:
+        """The patterns that frames show in this order, given those that they are said to show."""
+        if self.kind == "reversed":
+            return patterns[::-1]
+        if self.kind == "rolled":
+            return np.roll(patterns, -self.by)
+        later = np.arange(len(patterns)) >= self.first
+        return np.clip(patterns + self.by * later, 0, len(patterns) - 1)
+
+
+def check_frames(stack: Stack) -> None:
+    """Find the frames that do not show their patterns, and annotate the stack with them.
+
+    ``odd_frames`` are single ones of random patterns, as with a hand in the picture, a flash, or a still in the place
+    of another: recovery does without them. ``order`` has the attributes of an `Order` if the frames are in another one.
+    ``constants_apart`` has ``frames`` of one constant that differ, and the ``share`` of the blocks that do. Both are
+    None otherwise.
+
+    Notes
+    -----
+    A block of the frame sees one place of the monitor best: the cell, of several grids, whose light in all patterns
+    correlates most with the block's. What blocks see of a frame is then correlated with what their cells have in each
+    pattern. Neither exposure nor the light of the room makes a difference to this, and a single wrong frame not to the
+    cells. A wrong order fits some cell by chance: orders are compared by how much like its own pattern each frame is.
+    """
+    stack.annotate(odd_frames=[], order=None, constants_apart=None)
+    program = Program.model_validate(stack.attributes["program"])
+    light = _light_of(stack)
+    if light is None:
+        return
+    patterns = np.array(stack.attributes["patterns"])
+    frames = np.flatnonzero(exposures_of(stack.attributes) == 1)
+    seen, patterns = light[frames], patterns[frames]
+    apart, share = _constants_apart(seen, patterns, program)
+    if share > WIDESPREAD:
+        stack.annotate(constants_apart={"frames": frames[apart].tolist(), "share": share})
+    parts = _random_parts(patterns, program)
+    if not parts:
+        return
+    cells = _cells(lay_out(program, _curve(program.monitor.response), stack.images()))
+    found = find_order(seen, patterns, cells, parts)
+    if found is not None:
+        stack.annotate(order=found._replace(first=int(frames[found.first]))._asdict())
+        return
+    odd = np.union1d(find_odd(seen, patterns, cells, parts), _beyond(seen, patterns, program, parts))
+    if odd.size <= MOST_ODD * sum(map(len, parts)):
+        stack.annotate(odd_frames=frames[odd].tolist())
+
+
+def find_odd(seen: Floats, patterns: Integers, cells: Floats, parts: Sequence[Integers]) -> Integers:
+    """The frames that look unlike their patterns, where others of their part do not.
+
+    Parameters
+    ----------
+    seen : (frames, n) float32
+        The light of blocks.
+    patterns : (frames,) intp
+        The pattern of each frame.
+    cells : (patterns, cells) float32
+        The light of the monitor.
+    parts : sequence of intp
+        The frames of each part to compare.
+    """
+    alike = _alikeness(seen, patterns, cells, np.concatenate(parts))
+    odd: list[Integers] = []
+    at = 0
+    for frames in parts:
+        own = alike[at : at + len(frames)]
+        at += len(frames)
+        typical = float(np.median(own))
+        usual = 1.4826 * float(np.median(np.abs(own - typical)))
+        below = (own < BELOW * typical) & (own < typical - SPREAD) | (own < HARDLY * typical)
+        below &= own < typical - SURE * usual
+        odd.append(frames[below] if typical >= TYPICAL else frames[:0])
+    return np.concatenate(odd)
+
+
+def find_order(seen: Floats, patterns: Integers, cells: Floats, parts: Sequence[Integers]) -> Order | None:
+    """The order that the frames are in, None if it is that of the patterns; parameters as of `find_odd`."""
+    compared = np.concatenate(parts)
+    rng = np.random.Generator(np.random.PCG64(0))
+    chance = float(np.mean([_score(seen, rng.permutation(patterns), cells, compared) for _ in range(ORDERS)]))
+    own = _score(seen, patterns, cells, compared)
+    # Only frames that stand for the patterns one by one can be in another order.
+    if len(patterns) <= MOST and np.array_equal(patterns, np.arange(len(patterns))):
+        few, coarse = seen[:, :: -(-seen.shape[1] // FEW)], cells[:, : _count(GRIDS[:-1])]
+
+        def likeness(order: Order) -> float:
+            return _score(few, order.of(patterns), coarse, compared)
+
+        def closely(order: Order) -> float:
+            return _score(seen, order.of(patterns), cells, compared)
+
+        step = -(-len(compared) // STARTS)
+        tried = [Order("shifted", n, by) for n in compared[::step].tolist() for by in SHIFTS]
+        if own < CLEAR * chance:
+            tried += [Order("rolled", by=by) for by in range(1, len(patterns))] + [Order("reversed")]
+        found = max(tried, key=likeness)
+        if found.kind == "shifted" and likeness(found) > _score(few, patterns, coarse, compared):
+            near = range(max(found.first - step, 0), min(found.first + step, len(patterns)))
+            found = max((found._replace(first=n) for n in near), key=closely)
+        best = closely(found)
+        if best > max(own + GAIN, CLEAR * chance):
+            return found
+    return Order("unlike") if own < UNLIKE * chance else None
+
+
+def _score(seen: Floats, patterns: Integers, cells: Floats, compared: Integers) -> float:
+    """How much the frames compared look like their patterns: the sum of `_alikeness`."""
+    return float(_alikeness(seen, patterns, cells, compared).sum())
+
+
+def _alikeness(seen: Floats, patterns: Integers, cells: Floats, compared: Integers) -> Floats:
+    """Correlations, (k,), of what blocks see of the k frames compared with what their cells have in their patterns."""
+    of_frames = cells[patterns]
+    cell = np.argmax(_unit(seen, 0).T @ _unit(of_frames, 0), axis=1)
+    of_cell = of_frames[:, cell]
+    centre, scale = np.median(seen, axis=0), np.maximum(seen.std(axis=0), 1e-9)
+    shown = (of_cell[compared] - of_cell.mean(axis=0)) / np.maximum(of_cell.std(axis=0), 1e-9)
+    alike: Floats = (_unit((seen[compared] - centre) / scale, 1) * _unit(shown, 1)).sum(axis=1)
+    return alike
+
+
+def _unit(values: Floats, axis: int) -> Floats:
+    """Values less their mean along an axis, of length 1."""
+    values = values - values.mean(axis=axis, keepdims=True)
+    unit: Floats = values / np.maximum(np.linalg.norm(values, axis=axis, keepdims=True), 1e-9)
+    return unit
+
+
+def _beyond(seen: Floats, patterns: Integers, program: Program, parts: Sequence[Integers]) -> Integers:
+    """The frames of random patterns that are brighter than white or darker than black where usual ones are not."""
+    ends = _ends(seen, patterns, program)
+    if ends is None:
+        return np.zeros(0, np.intp)
+    dark, bright = (np.median(frames, axis=0) for frames in ends)
+    frames = np.concatenate(parts)
+    room = BEYOND * np.maximum(bright - dark, 0)
+    beyond = ((seen[frames] > bright + room) | (seen[frames] < dark - room)).mean(axis=1)
+    odd: Integers = frames[beyond > COVERED + np.median(beyond)]
+    return odd
+
+
+def _constants_apart(seen: Floats, patterns: Integers, program: Program) -> tuple[Integers, float]:
+    """The frames of black or of white, whichever differ more from each other, and the share of blocks that do."""
+    ends = _ends(seen, patterns, program)
+    if ends is None:
+        return np.zeros(0, np.intp), 0.0
+    white = float(np.quantile(np.median(ends[1], axis=0), BRIGHTEST))
+    shares = [float((np.ptp(frames, axis=0) > APART * white).mean()) for frames in ends]
+    numbers, sent = program.constants
+    level = sent.sum(axis=1)
+    end = (level.min(), level.max())[int(np.argmax(shares))]
+    return np.flatnonzero(np.isin(patterns, numbers[level == end])), max(shares)
+
+
+def _ends(seen: Floats, patterns: Integers, program: Program) -> tuple[Floats, Floats] | None:
+    """What blocks see of the darkest and of the brightest constants, (frames, n) each."""
+    numbers, sent = program.constants
+    level = sent.sum(axis=1)
+    dark, bright = (seen[np.isin(patterns, numbers[level == end])] for end in (level.min(), level.max()))
+    return (dark, bright) if len(dark) and len(bright) else None
+
+
+def _light_of(stack: Stack) -> Floats | None:
+    """The approximate light of blocks that are to be recovered and see the monitor, (frames, n)."""
+    thumbnails = stack.thumbnails()
+    if thumbnails is None:
+        return None
+    edge = thumbnail_edge(stack.height, stack.width)
+    down, across = (np.arange(0, size, edge) for size in (stack.height, stack.width))
+    wanted = np.logical_or.reduceat(np.logical_or.reduceat(stack.mask(), down, axis=0), across, axis=1)
+    light = to_light(
+        thumbnails[:, wanted].astype(np.float32) / np.float32(65535), _curve(stack.attributes["response"])
+    )
+    changes = light.std(axis=0)
+    light = light[:, changes > CHANGES * np.quantile(changes, BRIGHTEST)]
+    if light.shape[1] < FEWEST:
+        return None
+    chosen = np.unique(np.linspace(0, light.shape[1] - 1, PLACES).astype(int))
+    return light[:, chosen]
+
+
+def _curve(response: Any) -> Curve:
+    """A curve that is close enough to compare light by."""
+    return "linear" if response == "linear" else "srgb"
+
+
+def _random_parts(patterns: Integers, program: Program) -> list[Integers]:
+    """The frames of each random part, if there are enough of them."""
+    found = []
+    for part, (start, end) in zip(program.parts, pairwise(program.starts), strict=True):
+        frames = np.flatnonzero((patterns >= start) & (patterns < end))
+        if isinstance(part, Bernoulli) and len(frames) >= MIN_PATTERNS:
+            found.append(frames)
+    return found
+
+
+def _cells(light: Floats) -> Floats:
+    """The light of every pattern in the cells of all `GRIDS`, (patterns, cells)."""
+    grey = light.mean(axis=3, keepdims=True)
+    return np.concatenate(
+        [np.stack([area_mean(one, *grid).ravel() for one in grey]) for grid in GRIDS], axis=1
+    )
+
+
+def _count(grids: Sequence[tuple[int, int]]) -> int:
+    return sum(columns * rows for columns, rows in grids)
