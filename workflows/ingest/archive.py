@@ -109,7 +109,10 @@ class CaptureArchive:
             elif MATTE in self._entries:
                 why = "this is the archive of a matte: import it, with `envmatte import` or in the web app"
             else:
-                why = f"there is no {MANIFEST} at the root of the archive"
+                why = (
+                    f"there is no {MANIFEST} at the root of the archive: make it of the film or the stills with "
+                    "`envmatte pack`, or drop these in the web app as they are, without a ZIP"
+                )
             raise CaptureError(why, entry=MANIFEST)
         if info.file_size > MANIFEST_BYTES:
             raise CaptureError(

@@ -80,7 +80,7 @@ def entries(
         if stat.S_ISLNK(info.external_attr >> 16):
             raise refusal(f"{name!r} is a link: put the file itself in the archive", entry=name)
         if info.flag_bits & 1:
-            raise refusal(f"{name!r} is encrypted", entry=name)
+            raise refusal(f"{name!r} is encrypted: make the archive without a password", entry=name)
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             # zipfile unpacks bzip2 and LZMA without bounds.
             raise refusal(

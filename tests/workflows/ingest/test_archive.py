@@ -68,7 +68,7 @@ def refused(data: bytes, limits: Limits = LIMITS) -> CaptureError:
     [
         ("my film/capture.json", "my film/capture.json must be at the root"),
         ("zarr.json", "the archive of a matte"),
-        ("film.mp4", "there is no capture.json"),
+        ("film.mp4", "make it of the film or the stills with `envmatte pack`"),
     ],
 )
 def test_what_is_there_in_place_of_a_capture_is_named(name: str, why: str) -> None:
@@ -230,7 +230,7 @@ def test_encrypted_entries_are_refused(make_zip: Zip) -> None:
     data = bytearray(make_zip(RECORD, FILES))
     at = data.rindex(b"PK\x01\x02")
     data[at + 8] |= 1
-    assert "encrypted" in refused(bytes(data)).detail
+    assert "without a password" in refused(bytes(data)).detail
     assert refused(bytes(data)).fields == {"entry": "frames/4.png"}
 
 

@@ -274,7 +274,7 @@ export const de = {
 	"the {format} image is cut off or damaged: copy it again from the camera, or save it again": "das Bild ({format}) ist abgeschnitten oder beschädigt: neu von der Kamera kopieren oder neu speichern",
 	"the {format} image is cut off or damaged: copy it again from the camera, or save it as JPEG or PNG": "das Bild ({format}) ist abgeschnitten oder beschädigt: neu von der Kamera kopieren oder als JPEG oder PNG speichern",
 	"the {format} image is cut off or damaged: export it again": "das Bild ({format}) ist abgeschnitten oder beschädigt: neu exportieren",
-	"there is no {entry} at the root of the archive": "es gibt kein {entry} auf der obersten Ebene des Archivs",
+	"there is no {entry} at the root of the archive: make it of the film or the stills with `envmatte pack`, or drop these in the web app as they are, without a ZIP": "es gibt kein {entry} auf der obersten Ebene des Archivs: es mit `envmatte pack` aus dem Film oder den Fotos machen, oder diese ohne ZIP in der Web-App ablegen",
 	"this PNG is animated: save a single picture": "dieses PNG ist animiert: ein einzelnes Bild speichern",
 	"this camera's RAW format is not supported: convert it to DNG, with lossless compression other than JPEG XL, or develop it to TIFF of 16 bits with a linear curve": "das RAW-Format dieser Kamera ist nicht lesbar: in DNG umwandeln, verlustfrei und nicht mit JPEG XL, oder als TIFF mit 16 Bit und linearer Kennlinie entwickeln",
 	"this is not a {formats} or HEIC image, or it is cut off: copy it again from the camera, or save it as PNG": "das ist kein Bild in {formats} oder HEIC, oder es ist abgeschnitten: neu von der Kamera kopieren oder als PNG speichern",
