@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from services.client import Busy, _transport
+from services.client import Busy, _session
 from services.runtime import certificates
 from storage.objects.store import Objects
 from tests.end_to_end.conftest import Service, digests, serving
@@ -47,7 +47,7 @@ def test_matte_is_the_same_in_a_bucket_and_in_a_folder(
 def test_a_store_that_refuses_is_named_to_all_who_ask(
     capture_archive: Path, s3: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_transport, "PATIENCE", 1.0)
+    monkeypatch.setattr(_session, "PATIENCE", 1.0)
     with serving(tmp_path / "data", "--store", s3, "--workers", "1"):
         pass  # later starts don't wait for a store that is away
     where = ("--store", s3.replace("envmatte", "another"), "--workers", "1")

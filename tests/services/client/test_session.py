@@ -9,7 +9,7 @@ from http.server import BaseHTTPRequestHandler
 import pytest
 
 from services.client import Busy, Client, ServiceError, Unreachable
-from services.client._transport import FIRST_PAUSE, LONGEST_PAUSE
+from services.client._session import FIRST_PAUSE, LONGEST_PAUSE
 from tests.services.client.servers import Answer, ok, refusal, scripted_server, web_server
 
 

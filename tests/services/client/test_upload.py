@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from services.client import _upload
-from services.client._transport import PATIENCE, Transport
+from services.client._session import PATIENCE, Session
 from tests.services.client.servers import web_server
 
 MOST = 64 << 10
@@ -52,7 +52,7 @@ def test_requests_get_smaller_until_they_come_through_and_larger_again(
     data = bytes(range(256)) * (5 * MOST // 256)
     (tmp_path / "ball.zip").write_bytes(data)
     with web_server(Line) as url:
-        http = Transport(url, None)
+        http = Session(url, None)
         assert _upload.send(http, tmp_path / "ball.zip", {}, None) == {"id": "u"}
         http.close()
     assert come == data
