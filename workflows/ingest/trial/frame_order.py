@@ -24,11 +24,11 @@ BRIGHTEST = 0.98
 """The quantile of blocks that tells how much the brightest see."""
 CHANGES = 0.2
 """A block sees the monitor if its deviation is more than this share of the most changing blocks'."""
-TYPICAL, SPREAD, BELOW = 0.3, 0.25, 0.6
-"""A frame is odd if it resembles its pattern less than `BELOW` times as much as is typical of its part, by `SPREAD` at
-least, or hardly at all; no frame is in a part of which less than `TYPICAL` is typical."""
+TYPICAL = 0.3
+"""No frame is odd in a part whose frames typically resemble their patterns less than this."""
 HARDLY, SURE = 0.3, 5.0
-"""Hardly at all is less than this share of it. What is odd is so by this many of the part's standard deviations."""
+"""A frame is odd if it resembles its pattern less than this share of what is typical, and by so many of the part's
+standard deviations less. Through frosted glass, single good ones reach only 0.42 of it."""
 MOST_ODD = 0.1
 """A larger share of odd frames are not single accidents: they stay in, and other orders are tried."""
 BEYOND, COVERED = 0.1, 0.1
@@ -140,8 +140,7 @@ def find_odd(seen: Floats, patterns: Integers, cells: Floats, parts: Sequence[In
         at += len(frames)
         typical = float(np.median(own))
         usual = 1.4826 * float(np.median(np.abs(own - typical)))
-        below = (own < BELOW * typical) & (own < typical - SPREAD) | (own < HARDLY * typical)
-        below &= own < typical - SURE * usual
+        below = (own < HARDLY * typical) & (own < typical - SURE * usual)
         odd.append(frames[below] if typical >= TYPICAL else frames[:0])
     return np.concatenate(odd)
 
