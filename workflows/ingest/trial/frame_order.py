@@ -43,6 +43,10 @@ MOST = 1000
 GAIN, CLEAR = 2.0, 2.0
 """By how much, in frames that look exactly like their patterns, another order must look more like the program than the
 stated one; and how many times as much as random orders."""
+NAMED = 0.4
+"""How much frames must look like their patterns in an order that is named, on average: 1 is exactly."""
+EVEN = 1e-3
+"""Largest difference between the cells of a constant pattern, which is rounding."""
 UNLIKE = 1.5
 """The stated order must look this many times as much like the program as random orders."""
 ORDERS = 8
@@ -170,14 +174,18 @@ def find_order(seen: Floats, patterns: Integers, cells: Floats, parts: Sequence[
             near = range(max(found.first - step, 0), min(found.first + step, len(patterns)))
             found = max((found._replace(first=n) for n in near), key=closely)
         best = closely(found)
-        if best > max(own + GAIN, CLEAR * chance):
+        if best > max(own + GAIN, CLEAR * chance, NAMED * len(compared)):
             return found
     return Order("unlike") if own < UNLIKE * chance else None
 
 
 def _score(seen: Floats, patterns: Integers, cells: Floats, compared: Integers) -> float:
     """How much the frames compared look like their patterns: the sum of `_alikeness`."""
-    return float(_alikeness(seen, patterns, cells, compared).sum())
+    # Constants look the same in all cells, and would drown what frosted glass shows of the others.
+    uneven = np.ptp(cells[patterns], axis=1) > EVEN
+    kept = np.cumsum(uneven) - 1
+    compared = kept[compared[uneven[compared]]]
+    return float(_alikeness(seen[uneven], patterns[uneven], cells, compared).sum())
 
 
 def _alikeness(seen: Floats, patterns: Integers, cells: Floats, compared: Integers) -> Floats:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import sys
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -10,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from storage.layout import mattes
 from storage.layout.captures import Stack, _thumbnail
@@ -104,6 +106,17 @@ def test_stills_in_order_have_nothing_to_report(stills: list[Codes], scene: Scen
     ]
     assert found(dim, scene)["odd_frames"] == []
     assert found(dim, scene)["order"] is None
+
+
+@pytest.mark.parametrize("name", ["quick", "default"])
+@pytest.mark.parametrize("blur", [8, 24])
+def test_frosted_glass_is_in_order(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, name: str, blur: float
+) -> None:
+    program = preset(name, 320, 240)
+    monkeypatch.setattr(sys.modules[__name__], "PROGRAM", program)
+    frosted = [gaussian_filter(still, (blur, blur, 0)) for still in scene.film(program)]
+    assert found(frosted, scene)["order"] is None
 
 
 @pytest.mark.parametrize(
