@@ -86,9 +86,10 @@ def _of_work(connection: Connection) -> Iterator[Metric]:
     """Work done so far."""
     # From 0 on: Prometheus would not see a counter grow that begins with its first event.
     rows = {row.kind: row for row in statistics.work_totals(connection)}
+    kinds = dict.fromkeys((*KINDS, *rows))  # a newer service may know others
 
     def of_kinds(column: str) -> Labelled:
-        return [((kind,), getattr(rows.get(kind), column, 0)) for kind in KINDS]
+        return [((kind,), getattr(rows.get(kind), column, 0)) for kind in kinds]
 
     steps = SummaryMetricFamily(
         "envmatte_tile_seconds", "Seconds that workers spent on finished tiles.", labels=["kind"]

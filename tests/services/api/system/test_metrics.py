@@ -81,6 +81,14 @@ def test_tiles_are_counted_by_state(client: TestClient, job: str) -> None:
     assert found["envmatte_capture_bytes", "ingesting"] == 123
 
 
+def test_work_of_kinds_that_only_a_newer_service_knows_is_counted(
+    client: TestClient, engine: Engine, job: str
+) -> None:
+    with writing(engine) as c:
+        c.execute(update(tables.totals).where(tables.totals.c.kind == "recover").values(kind="polish"))
+    assert metrics(client)["envmatte_pixels_total", "polish"] == 500
+
+
 def test_trouble_is_reported_without_a_coordinator(client: TestClient, engine: Engine) -> None:
     assert metrics(client)[("envmatte_trouble",)] == 1
     assert ("envmatte_coordinator_last_sign_seconds",) not in metrics(client)
