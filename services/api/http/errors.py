@@ -4,6 +4,7 @@ import logging
 from http import HTTPStatus
 from typing import Any
 
+import anyio.to_thread
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
@@ -63,7 +64,8 @@ def register(app: FastAPI) -> None:
     async def _ours(request: Request, error: EnvmatteError) -> JSONResponse:
         if isinstance(error, Corrupt):
             try:
-                marker.require_mounted(request.app.state.context.objects)
+                # In a thread: a share that hangs must not stop all other requests.
+                await anyio.to_thread.run_sync(marker.require_mounted, request.app.state.context.objects)
             except StoreUnavailable as away:  # nothing is missing
                 error = away
         base = next((base for base in type(error).__mro__ if base in HEADERS), type(error))

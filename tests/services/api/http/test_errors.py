@@ -1,5 +1,11 @@
 """Errors as answers: headers that a status needs besides the problem detail."""
 
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+
 import pytest
 from fastapi import FastAPI, Request
 from fastapi.testclient import TestClient
@@ -11,7 +17,9 @@ from services.api.mattes.composite_params import CompositeParams
 from services.api.mattes.links import LinkRequest
 from services.api.programs.programs import PlaybackState, ProgramRequest
 from services.runtime.problems import Unauthorized
-from storage.errors import EnvmatteError, NotFound, Unavailable
+from storage.errors import Corrupt, EnvmatteError, NotFound, Unavailable
+from storage.objects import marker
+from storage.objects.store import Objects
 
 
 @pytest.mark.parametrize(
@@ -39,6 +47,33 @@ def test_error_is_answered_with_the_header_of_its_status(
     assert {(name, value) for name, value in extra if name != "content-length"} == (
         {header} if header else set()
     )
+
+
+def test_share_that_hangs_holds_up_no_other_request(tmp_path: Path) -> None:
+    app = FastAPI()
+    register(app)
+    objects = Objects((tmp_path / "store").as_uri())
+    objects.installation = "an-id"
+    os.mkfifo(tmp_path / "store" / marker.PATH)  # reading it waits for a writer
+    app.state.context = SimpleNamespace(objects=objects)
+
+    @app.get("/damaged")
+    def fail() -> None:
+        raise Corrupt("it is damaged")
+
+    @app.get("/alive")
+    async def alive() -> str:
+        return "alive"
+
+    with TestClient(app) as client, ThreadPoolExecutor(2) as pool:
+        damaged = pool.submit(client.get, "/damaged")
+        try:
+            time.sleep(0.5)
+            assert pool.submit(client.get, "/alive").result(timeout=5).json() == "alive"
+            assert not damaged.done()
+        finally:
+            (tmp_path / "store" / marker.PATH).write_bytes(b"another")
+        assert damaged.result().status_code == 503
 
 
 @pytest.mark.parametrize(
