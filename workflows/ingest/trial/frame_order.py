@@ -103,9 +103,9 @@ def check_frames(stack: Stack) -> None:
     light = _light_of(stack)
     if light is None:
         return
-    patterns = np.array(stack.attributes["patterns"])
+    stated = np.array(stack.attributes["patterns"])
     frames = np.flatnonzero(exposures_of(stack.attributes) == 1)
-    seen, patterns = light[frames], patterns[frames]
+    seen, patterns = light[frames], stated[frames]
     apart, share = _constants_apart(seen, patterns, program)
     if share > WIDESPREAD:
         stack.annotate(constants_apart={"frames": frames[apart].tolist(), "share": share})
@@ -119,7 +119,9 @@ def check_frames(stack: Stack) -> None:
         return
     odd = np.union1d(find_odd(seen, patterns, cells, parts), _beyond(seen, patterns, program, parts))
     if odd.size <= MOST_ODD * sum(map(len, parts)):
-        stack.annotate(odd_frames=frames[odd].tolist())
+        # Longer exposures, which clip, are not compared: those of a pattern were taken together.
+        lost = np.setdiff1d(patterns[odd], np.delete(patterns, odd))
+        stack.annotate(odd_frames=np.union1d(frames[odd], np.flatnonzero(np.isin(stated, lost))).tolist())
 
 
 def find_odd(seen: Floats, patterns: Integers, cells: Floats, parts: Sequence[Integers]) -> Integers:

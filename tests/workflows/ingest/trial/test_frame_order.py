@@ -162,6 +162,20 @@ def test_single_frames_of_something_else_are_odd(
     assert found(changed, scene) == {"odd_frames": odd, "order": None, "constants_apart": None}
 
 
+def test_longer_exposures_of_an_odd_frame_are_odd(stills: list[Codes], scene: Scene) -> None:
+    swapped = replaced(stills, {MIDDLE: stills[MIDDLE + 1], MIDDLE + 1: stills[MIDDLE]})
+    exposures = (1.0, 2.0)
+    frames = Frames(
+        [still // 2 * int(factor) for still in swapped for factor in exposures], scene.object_mask
+    )
+    frames.attributes |= {
+        "patterns": np.repeat(np.arange(COUNT), 2).tolist(),
+        "exposures": list(exposures) * COUNT,
+    }
+    check_frames(cast(Stack, frames))
+    assert frames.attributes["odd_frames"] == list(range(2 * MIDDLE, 2 * MIDDLE + 4))
+
+
 def test_light_that_is_switched_on_makes_black_frames_differ(stills: list[Codes], scene: Scene) -> None:
     lit = [still if n < MIDDLE else flashed(still) for n, still in enumerate(stills)]
     apart = found(lit, scene)["constants_apart"]
