@@ -72,8 +72,8 @@ def odd_frames(odd: list[int]) -> list[Finding]:
         Finding(
             name="odd_frames",
             level="warning",
-            message=f"{len(odd)} frames do not show their patterns ({ranges(odd)}), as with a hand in the picture, a "
-            "flash, or another still in their place: recovery does without them",
+            message="not all frames show their patterns, as with a hand in the picture, a flash, or another still in "
+            f"the place of one: recovery does without {ranges(odd)}",
             remedy="keep everything still and dark while the patterns are shown, and take one still of each",
         )
     ]
