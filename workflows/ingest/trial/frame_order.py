@@ -51,8 +51,9 @@ UNLIKE = 1.5
 """The stated order must look this many times as much like the program as random orders."""
 ORDERS = 8
 """Random orders to compare with."""
-APART, WIDESPREAD = 0.1, 0.05
-"""Frames of one constant differ if more than `WIDESPREAD` of the blocks do, by more than `APART` of white."""
+APART, FAINT, WIDESPREAD = 0.1, 0.01, 0.05
+"""Frames of one constant differ if more than `WIDESPREAD` of the blocks do, by more than `APART` of white, and by more
+than `FAINT` of full scale: less is noise, where white is dark."""
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.intp]
@@ -227,7 +228,7 @@ def _constants_apart(seen: Floats, patterns: Integers, program: Program) -> tupl
     if ends is None:
         return np.zeros(0, np.intp), 0.0
     white = float(np.quantile(np.median(ends[1], axis=0), BRIGHTEST))
-    shares = [float((np.ptp(frames, axis=0) > APART * white).mean()) for frames in ends]
+    shares = [float((np.ptp(frames, axis=0) > max(APART * white, FAINT)).mean()) for frames in ends]
     numbers, sent = program.constants
     level = sent.sum(axis=1)
     end = (level.min(), level.max())[int(np.argmax(shares))]

@@ -108,6 +108,14 @@ def test_stills_in_order_have_nothing_to_report(stills: list[Codes], scene: Scen
     assert found(dim, scene)["order"] is None
 
 
+def test_noise_in_the_dark_is_no_other_light(stills: list[Codes], scene: Scene) -> None:
+    rng = np.random.default_rng(0)
+    dark = [
+        np.clip(0.03 * still + rng.normal(1, 1, still.shape), 0, 255).astype(np.uint8) for still in stills
+    ]
+    assert found(dark, scene)["constants_apart"] is None
+
+
 @pytest.mark.parametrize("name", ["quick", "default"])
 @pytest.mark.parametrize("blur", [8, 24])
 def test_frosted_glass_is_in_order(
