@@ -44,9 +44,8 @@ def _opened(given: dict[str, Any]) -> Iterator[tuple["Settings", "Engine", "Obje
     engine = open_without_upgrade(settings.database_url)
     try:
         objects = Objects(settings.store_url)
-        installation.require(
-            engine, objects
-        )  # otherwise all would be missing, with advice to upload it again
+        # In another store all would be missing, with advice to upload it again.
+        installation.require(engine, objects)
         yield settings, engine, objects
     finally:
         engine.dispose()

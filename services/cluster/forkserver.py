@@ -28,9 +28,8 @@ def start_forkserver(*modules: str) -> None:
     """
     try:
         os.chdir(os.getcwd())
-    except (
-        OSError
-    ):  # it was deleted, or this user may not enter it, as after `sudo -u`; workers want to go there
+    except OSError:
+        # It was deleted, or this user may not enter it, as after `sudo -u`; workers want to go there.
         os.chdir("/")
     for name, value in dask.config.get("distributed.nanny.pre-spawn-environ").items():
         os.environ[name] = str(value)  # as nannies do, but before libraries that read it are loaded

@@ -33,9 +33,8 @@ def unknown_variables(names: Container[str]) -> list[str]:
 
 def _all() -> dict[str, str]:
     lines: dict[str, str | None] = {}
-    if os.path.isfile(
-        FILE
-    ):  # not `Path.is_file`, which fails in a working directory that this user may not search
+    # Not `Path.is_file`, which fails in a working directory that this user may not search.
+    if os.path.isfile(FILE):
         from dotenv import dotenv_values
 
         lines = dotenv_values(FILE)

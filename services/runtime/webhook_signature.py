@@ -32,9 +32,8 @@ def signing_key(secret: str) -> bytes:
     if secret.startswith(PREFIX):
         try:
             encoded = key[len(PREFIX) :]
-            key = base64.b64decode(
-                encoded + b"=" * (-len(encoded) % 4), validate=True
-            )  # padding may be left out
+            padding = b"=" * (-len(encoded) % 4)  # it may be left out
+            key = base64.b64decode(encoded + padding, validate=True)
         except binascii.Error as error:
             raise ValueError(f"must be Base64 after {PREFIX}") from error
     if len(key) < LEAST_BYTES:

@@ -168,10 +168,8 @@ class _NamingPipeline(BatchedCodecPipeline):
         batch = list(batch_info)
         try:
             return await super().read_batch(batch, *given, **more)
-        except (
-            ValueError,
-            RuntimeError,
-        ) as error:  # ValueError from Crc32cCodec and numpy, RuntimeError from zstd
+        # ValueError from Crc32cCodec and numpy, RuntimeError from zstd.
+        except (ValueError, RuntimeError) as error:
             raise damaged(batch[0][0].path) from error
 
 

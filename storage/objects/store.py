@@ -313,9 +313,8 @@ class Objects:
             _remove(target.with_name(target.name + SUFFIX))
             return
         with translate_errors():
-            obstore.delete(
-                self._store, [path, path + SUFFIX]
-            )  # a bucket does not list an object below its own path
+            # A bucket does not list an object below its own path.
+            obstore.delete(self._store, [path, path + SUFFIX])
             for batch in obstore.list(self._store, path, chunk_size=500):
                 obstore.delete(self._store, [meta["path"] for meta in batch])
 

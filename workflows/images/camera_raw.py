@@ -118,9 +118,8 @@ def develop(data: bytes, *, memory: int) -> NDArray[np.float32]:
     """
     light, turn, balance, to_srgb = _read(data, memory)
     light *= balance.astype(np.float32)
-    np.minimum(
-        light, 1, out=light
-    )  # also what is clipped: a highlight in which only green is left is magenta
+    # Also what is clipped: a highlight in which only green is left is magenta.
+    np.minimum(light, 1, out=light)
     for row in light:  # row by row, so that no second picture is in memory
         row[:] = np.clip(row @ to_srgb.T.astype(np.float32), 0, 1)
     return upright(light, turn)

@@ -54,9 +54,8 @@ class Storage(NamedTuple):
             return pixels  # type: ignore[return-value]
         span = np.iinfo(self.dtype).max - self.black
         codes = np.empty(pixels.shape, self.dtype)
-        for row, stored in zip(
-            pixels, codes, strict=True
-        ):  # row by row, so that no second frame is in memory
+        # Row by row, so that no second frame is in memory.
+        for row, stored in zip(pixels, codes, strict=True):
             scaled = np.nan_to_num(row * np.float32(span / self.full), nan=-np.inf)
             stored[:] = np.rint(np.clip(scaled + np.float32(self.black), 0, np.iinfo(self.dtype).max))
         return codes

@@ -106,10 +106,8 @@ def checks(engine: Engine, objects: Objects) -> dict[str, Check]:
     def store() -> str:
         objects.check_reachable()
         if objects.installation is None:  # it stays the same; there is none until a coordinator has started
-            with (
-                suppress(Unavailable, SQLAlchemyError),
-                reading(engine) as c,
-            ):  # which the database's check tells
+            # The database's check tells what is wrong with it.
+            with suppress(Unavailable, SQLAlchemyError), reading(engine) as c:
                 objects.installation = installation.find(c)
         if objects.installation is not None:
             marker.require(objects, objects.installation)

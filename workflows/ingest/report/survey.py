@@ -112,10 +112,9 @@ class _Windows:
         self._look_up, self._top, self._gain = look_up_of(stack), clipped_from(stack), local_gain(stack)
         self._noise = NoiseModel(**stack.attributes["noise"])
         self._pixels = 0
-        self._clipped = np.zeros(
-            (2, len(frames.chosen)), np.int64
-        )  # at black and at full scale, of each frame,
-        self._ends = np.zeros((2, 2))  # and of the black and the white frame
+        # At black and at full scale: of each frame, and of the black and the white one.
+        self._clipped = np.zeros((2, len(frames.chosen)), np.int64)
+        self._ends = np.zeros((2, 2))
         self._contrasts: list[NDArray[np.float32]] = []
         self._deviations: list[NDArray[np.float32]] = []
         self._brightest: list[NDArray[np.float32]] = []

@@ -80,9 +80,8 @@ def shortest_path(
         The events with boundaries in the order of time, and the cost; None if no path fits.
     """
     n, times, options = len(same) + 1, recording.times, _options(recording, hold)
-    hidden = np.concatenate(
-        [[0, 0], np.cumsum(np.where(same, _SAME, _HIDDEN)), [np.inf]]
-    )  # cost up to each boundary
+    # Cost up to each boundary.
+    hidden = np.concatenate([[0, 0], np.cumsum(np.where(same, _SAME, _HIDDEN)), [np.inf]])
     cost = np.full((len(options), n + 1), np.inf)
     before = np.full((len(options), n + 1, 2), -1, np.int32)
     begins = np.searchsorted([option.event for option in options], range(len(recording.events)))
