@@ -70,9 +70,8 @@ def test_upload_report_recovery_and_composite(tab: Page, service: Service, ball:
     tab.get_by_label("Choose a film, stills or a capture archive").set_input_files(ball)
     expect(tab).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
     expect(tab.get_by_role("heading", name="a ball")).to_be_visible()
-    expect(tab.get_by_role("region", name="Report")).to_be_visible(
-        timeout=3 * MINUTE
-    )  # kernels compile first
+    # Kernels compile first.
+    expect(tab.get_by_role("region", name="Report")).to_be_visible(timeout=3 * MINUTE)
     capture = service.client.capture(tab.url.rpartition("/")[2])
     report = service.http.get(capture["report"]).json()
     expect(tab.get_by_role("heading", name=re.compile("expect( at best)? .* clear glass"))).to_be_visible()

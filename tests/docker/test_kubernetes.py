@@ -82,9 +82,8 @@ def test_every_name_refers_to_an_object() -> None:
         assert port["targetPort"] in [one["name"] for one in container(served)["ports"]]
     scaled = object_of("HorizontalPodAutoscaler", "envmatte-worker")["spec"]["scaleTargetRef"]["name"]
     assert "cpu" in container(scaled)["resources"]["requests"]  # utilisation is relative to the request
-    assert (
-        "replicas" not in object_of("Deployment", scaled)["spec"]
-    )  # otherwise every `kubectl apply` would reset it
+    # Otherwise every `kubectl apply` would reset it.
+    assert "replicas" not in object_of("Deployment", scaled)["spec"]
 
 
 def test_only_the_port_of_the_api_is_open_to_others() -> None:

@@ -127,9 +127,8 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Attacked]:
         "ENVMATTE_MATTE_MEMORY": str(MATTE_MEMORY),
         "ENVMATTE_OWNER_JOBS": "1",
     }
-    use_matte(
-        Objects((folder / "warm").as_uri())
-    )  # a service that compiles kernels itself keeps 150 MB for it
+    # A service that compiles kernels itself keeps 150 MB for it.
+    use_matte(Objects((folder / "warm").as_uri()))
     with serving(data, "--workers", "1", **settings) as service:
         yield prepare(service, data, folder)
 

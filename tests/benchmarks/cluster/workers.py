@@ -14,9 +14,8 @@ from services.cluster.dask_config import NO_DASHBOARD, configure_dask
 async def run(scheduler: str, count: int) -> None:
     """Run workers until this process is killed."""
     configure_dask()
-    dask.config.set(
-        {"distributed.admin.system-monitor.interval": "1 h"}
-    )  # all would look at the same process
+    # All would look at the same process.
+    dask.config.set({"distributed.admin.system-monitor.interval": "1 h"})
     async with AsyncExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         for _ in range(count):

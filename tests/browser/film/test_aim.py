@@ -55,9 +55,8 @@ def seen(
     level = ndimage.map_coordinates(shown, [v, u], order=1, cval=0.0)
     from_glass = np.hypot(across / width, (y - 0.62 * height) / height)
     level *= np.where(from_glass < 0.13, 0.35 + 0.5 * np.sin(40 * from_glass) ** 2, 1)
-    level *= np.where(
-        (abs(across) < 0.12 * width) & (down > 0.22 * height), 0.2, 1
-    )  # its foot hides the border
+    # Its foot hides the border.
+    level *= np.where((abs(across) < 0.12 * width) & (down > 0.22 * height), 0.2, 1)
     picture = ndimage.gaussian_filter(light[0] + (light[1] - light[0]) * level, blur)
     picture += np.random.default_rng(seed).normal(0, noise, picture.shape)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)

@@ -59,9 +59,8 @@ def test_region_is_recovered_first(service: Service, capture: str) -> None:
 def test_job_without_tiles_of_a_frame_takes_no_region(service: Service, capture: str) -> None:
     region = {"x": 0, "y": 0, "width": 8, "height": 8}
     ingest = service.client.capture(capture).job
-    assert (
-        service.http.patch(f"/v1/jobs/{ingest}", json={"region": region}).status_code == 409
-    )  # it has ended
+    # It has ended.
+    assert service.http.patch(f"/v1/jobs/{ingest}", json={"region": region}).status_code == 409
     job = service.client.recover(capture, quality="fast")
     for wrong in ({"region": region | {"width": 0}}, {"region": [0, 0, 8, 8]}, {"state": "failed"}):
         answer = service.http.patch(f"/v1/jobs/{job.id}", json=wrong)

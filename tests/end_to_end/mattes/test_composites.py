@@ -325,9 +325,8 @@ def test_requests_leak_nothing(service: Service, matte: str, requests: int) -> N
         looks.append(held())
     assert set(looks[0]) <= set(looks[-1]), "a decoder is gone"
     assert 1 < len(looks[-1]) <= 1 + askers
-    sums = np.array(
-        [sum(look[pid] for pid in looks[0]) for look in looks]
-    )  # other decoders may have been started
+    # Other decoders may have been started.
+    sums = np.array([sum(look[pid] for pid in looks[0]) for look in looks])
     print(f"bytes, open files and threads, every {requests // 6} requests: {sums.tolist()}")
     _, files, threads = sums[4:].min(axis=0) - sums[:3].min(axis=0)  # what leaks does not come back
     # Under load blocks of 19 MB come, and stay: what leaks grows from look to look.

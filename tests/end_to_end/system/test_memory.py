@@ -70,10 +70,8 @@ def test_upload_over_the_limit_is_not_read(capture_archive: Path, tmp_path: Path
     limit = capture_archive.stat().st_size - 1
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:
         headers = {"Content-Type": "application/zip"}
-        for content in (
-            capture_archive.read_bytes(),
-            iter([capture_archive.read_bytes()]),
-        ):  # the second without Content-Length
+        # The second without Content-Length.
+        for content in (capture_archive.read_bytes(), iter([capture_archive.read_bytes()])):
             answer = service.http.post("/v1/captures", content=content, headers=headers)
             assert answer.status_code == 413
             assert answer.json()["limit"] == limit

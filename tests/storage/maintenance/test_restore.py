@@ -347,9 +347,8 @@ def test_killed_restore_can_be_repeated(
     assert MARKER in store.names("")
     store.put("mattes/x/left", b"of the first")
     other = dialects.make_engine(f"{second.url.render_as_string()}.other")
-    with pytest.raises(
-        Conflict, match=r"its store .* has \w+/"
-    ):  # its objects may belong to the first database
+    # Its objects may belong to the first database.
+    with pytest.raises(Conflict, match=r"its store .* has \w+/"):
         restore(target, other, store)
     other.dispose()
     restore(target, second, store)

@@ -60,10 +60,8 @@ def test_every_orientation_of_every_kind(turn: int) -> None:
     np.testing.assert_array_equal(
         float_formats.decode(tiff(turn, PIXELS.astype(np.float32)), memory=MEMORY), expected
     )
-    for data in (
-        saved("JPEG", turn),
-        saved("TIFF", turn, compression="jpeg"),
-    ):  # the latter Pillow turns itself
+    # The latter Pillow turns itself.
+    for data in (saved("JPEG", turn), saved("TIFF", turn, compression="jpeg")):
         plain = integer_formats.decode(data, memory=MEMORY, turn=1)
         assert plain.shape == PIXELS.shape
         np.testing.assert_array_equal(integer_formats.decode(data, memory=MEMORY), shown(plain, turn))

@@ -24,12 +24,8 @@ def places_before(barrel: float = 0.0, radius: float = 0.6, noise: float = 3e-4)
     places[..., :2] = seen + noise * rng.standard_normal(seen.shape)
     places[..., 2], places[..., 3] = 0.004, 0.97
     outside = ((sight < 0) | (sight > 1)).any(axis=2)
-    places[outside] = rng.random((np.count_nonzero(outside), 4)) * (
-        1,
-        1,
-        0.1,
-        0.7,
-    )  # what a dark room seems to see
+    # What a dark room seems to see.
+    places[outside] = rng.random((np.count_nonzero(outside), 4)) * (1, 1, 0.1, 0.7)
     return places, sight
 
 

@@ -24,9 +24,8 @@ def test_contrast_is_that_around_a_node() -> None:
     for (columns, rows), start in zip(pyramid.grids, pyramid.starts, strict=False):
         row = contrast[start : start + columns * rows, 0].reshape(rows, columns)[rows // 2]
         assert row[: columns // 2 - max(columns // 16, 2)].max() < 1e-6
-        assert (
-            row[columns // 2 - 1 : columns // 2 + 1].min() > 0.02
-        )  # 0.09 where half of it is on either side
+        # 0.09 where half of it is on either side.
+        assert row[columns // 2 - 1 : columns // 2 + 1].min() > 0.02
         np.testing.assert_allclose(row, row[::-1], atol=1e-5)
 
 

@@ -54,9 +54,8 @@ def test_ball_agrees_with_the_glass_ball() -> None:
     np.testing.assert_array_equal(traced.coverage, known.coverage)
     y, x = np.mgrid[:36, :48]
     off = np.hypot(x + 0.5 - 24, y + 0.5 - 18) / 18 / 0.85
-    inner = (off < 0.9) | (
-        off > 1.1
-    )  # at its edge the outside mirrors the monitor, which `glass_ball` leaves out
+    # At its edge the outside mirrors the monitor, which `glass_ball` leaves out.
+    inner = (off < 0.9) | (off > 1.1)
     light = backdrop(96, 72)
     np.testing.assert_allclose(traced.composite(light)[inner], known.composite(light)[inner], atol=2e-3)
 

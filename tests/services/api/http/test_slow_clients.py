@@ -110,9 +110,8 @@ def test_answers_that_nobody_takes_are_held_on_disk_and_given_up(
     assert whole.status_code == 200
     assert whole.headers["content-length"] == str(len(whole.content))
     assert len(whole.content) > 2_000_000
-    monkeypatch.setattr(
-        slow_clients, "CHECK_SECONDS", 30.0
-    )  # long enough for all connections to be open at once
+    # Long enough for all connections to be open at once.
+    monkeypatch.setattr(slow_clients, "CHECK_SECONDS", 30.0)
     process, count = psutil.Process(), 12
     before = process.memory_info().rss
     with contextlib.ExitStack() as stack:

@@ -55,9 +55,8 @@ class Film:
                 light[:, 5:9] = 0.7 * light[:, :1] + 0.1 * random.random((self.frames, 1, 1, 1))
         light += np.broadcast_to(veil, PROGRAM.count)[missing:, np.newaxis, np.newaxis, np.newaxis]
         light *= np.asarray(exposures)[: self.frames, np.newaxis, np.newaxis, np.newaxis]
-        if (
-            recorded
-        ):  # no camera: only what compression leaves of black beside white is neither black nor white
+        # No camera: only what compression leaves of black beside white is neither black nor white.
+        if recorded:
             lit = light > 0.2
             light = np.where(
                 lit, 1.0, 0.003 * random.random((self.frames, 1, 1, 1)) * np.roll(lit, 4, axis=2)
@@ -128,9 +127,8 @@ def test_light_of_the_border_is_told_apart_from_the_veil() -> None:
     y, _ = found.places
     assert found.own.shape == found.rest.shape == (PROGRAM.count, y.size)
     assert not ((y >= 5) & (y < 55)).any()
-    assert found.rest.std() == pytest.approx(
-        0.002 / np.sqrt(3), rel=0.2
-    )  # of three channels, without the bits' part
+    # Of three channels, without the bits' part.
+    assert found.rest.std() == pytest.approx(0.002 / np.sqrt(3), rel=0.2)
     assert found.own.max() > 0.29
 
 

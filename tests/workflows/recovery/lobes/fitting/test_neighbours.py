@@ -26,9 +26,8 @@ def test_each_pixel_comes_after_its_neighbours(places, seed):
             assert turn[q] < turn[p]
             assert np.abs(chosen[p] - chosen[q]).max() <= 4
     if seed is None:
-        assert (
-            np.count_nonzero((neighbours < 0).all(axis=1)) == 3
-        )  # of columns 40 to 59, those at 40, 48 and 56
+        # Of columns 40 to 59, those at 40, 48 and 56.
+        assert np.count_nonzero((neighbours < 0).all(axis=1)) == 3
 
 
 def test_pixels_without_places_have_no_neighbours():
