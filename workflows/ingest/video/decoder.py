@@ -42,6 +42,8 @@ class Clip:
         Its name, for errors.
     memory : int
         Bytes that one frame may take, at 16 bits a value.
+    threads : int
+        Threads that decode; each holds a frame.
 
     Attributes
     ----------
@@ -62,8 +64,8 @@ class Clip:
         If it cannot be read as a video, or its frames are too large.
     """
 
-    def __init__(self, file: BinaryIO, entry: str, memory: int) -> None:
-        self.entry, self._limit = entry, memory
+    def __init__(self, file: BinaryIO, entry: str, memory: int, threads: int = 2) -> None:
+        self.entry, self._limit, self._threads = entry, memory, threads
         self.lost: list[int] = []
         self.interlaced = False
         head = file.read(_HEAD)
@@ -178,7 +180,7 @@ class Clip:
         # The stream may state another size than the container: the decoder allocates no more than max_pixels.
         # With "explode", damage is an error rather than a guess at what was there.
         codec.options = {"max_pixels": str(max(self._limit // 6, 1)), "err_detect": "explode"}
-        codec.thread_count, codec.thread_type = 2, "AUTO"
+        codec.thread_count, codec.thread_type = self._threads, "AUTO"
         return stream
 
     def _seek(self, tick: int, back: int) -> bool:
@@ -253,9 +255,9 @@ class Clip:
             )
 
 
-def open_clip(file: BinaryIO, entry: str, memory: int) -> "closing[Clip]":
+def open_clip(file: BinaryIO, entry: str, memory: int, threads: int = 2) -> "closing[Clip]":
     """Open a `Clip` in a with statement."""
-    return closing(Clip(file, entry, memory))
+    return closing(Clip(file, entry, memory, threads))
 
 
 def tick_of(frame: VideoFrame) -> int:
