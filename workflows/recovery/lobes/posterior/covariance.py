@@ -65,7 +65,7 @@ class Preconditioner(NamedTuple):
     ones: NDArray[np.float32]
 
 
-class ConjugateGradients(NamedTuple):
+class Steps(NamedTuple):
     """Working space of conjugate gradients, each (groups (m + 2),) float32.
 
     Attributes
@@ -236,7 +236,7 @@ def add_stray_products(strays: NDArray[np.float32], p: NDArray[np.float32], out:
 
 @njit(nogil=True, cache=True)
 def solve_covariance(
-    K: Covariance, approximate: Preconditioner, most: int, steps: ConjugateGradients, x: NDArray[np.float32]
+    K: Covariance, approximate: Preconditioner, most: int, steps: Steps, x: NDArray[np.float32]
 ) -> int:
     """Solve ``K x = r`` by preconditioned conjugate gradients.
 
@@ -246,7 +246,7 @@ def solve_covariance(
     approximate : Preconditioner
     most : int
         Most steps; more are taken where most of the residual would be left.
-    steps : ConjugateGradients
+    steps : Steps
         `r` is the right-hand side, and is overwritten with the residual; 0 where nothing was measured.
     x : (groups (m + 2),) float32
         Written.

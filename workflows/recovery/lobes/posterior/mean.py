@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 from workflows.recovery.lobes.likelihood import estimate_kappa
 from workflows.recovery.lobes.posterior.covariance import (
-    ConjugateGradients,
     Covariance,
     Preconditioner,
+    Steps,
     precondition,
     solve_covariance,
     stray_variance,
@@ -157,7 +157,7 @@ def update(
         np.empty((rank, rank)),
         np.ones(rank, np.float32),
     )
-    steps = ConjugateGradients(np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y))
+    steps = Steps(np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y))
     kappa, misfit = 0.0, 0.0
     for _ in range(passes):
         mean[:], square[:], of_lobe[:], share[:] = 0, 0, 0, 0

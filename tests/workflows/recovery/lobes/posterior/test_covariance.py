@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from workflows.recovery.lobes.posterior.covariance import (
-    ConjugateGradients,
     Covariance,
     Preconditioner,
+    Steps,
     precondition,
     solve_covariance,
     stray_variance,
@@ -74,7 +74,7 @@ def empty(K, lobes):
 def solve(K, approximate, most, r):
     """The solution of `most` steps or more, and the number of steps."""
     x = np.empty_like(K.noise)
-    steps = ConjugateGradients(r.astype(np.float32), *(np.empty_like(x) for _ in range(3)))
+    steps = Steps(r.astype(np.float32), *(np.empty_like(x) for _ in range(3)))
     taken = solve_covariance(K, approximate, most, steps, x)
     return x, taken
 
