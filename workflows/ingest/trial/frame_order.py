@@ -1,4 +1,4 @@
-"""Whether each frame shows the pattern that it is said to, told by thumbnails, before anything is recovered."""
+"""Whether each frame shows the pattern that it is said to, by thumbnails, before anything is recovered."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -107,9 +107,11 @@ def check_frames(stack: Stack) -> None:
     stated = np.array(stack.attributes["patterns"])
     frames = np.flatnonzero(exposures_of(stack.attributes) == 1)
     seen, patterns = light[frames], stated[frames]
-    apart, share = _constants_apart(seen, patterns, program)
-    if share > WIDESPREAD:
-        stack.annotate(constants_apart={"frames": frames[apart].tolist(), "share": share})
+    ends = _ends(patterns, program)
+    if ends is not None:
+        apart, share = _constants_apart(seen, ends)
+        if share > WIDESPREAD:
+            stack.annotate(constants_apart={"frames": frames[apart].tolist(), "share": share})
     parts = _random_parts(patterns, program)
     if not parts:
         return
@@ -118,7 +120,9 @@ def check_frames(stack: Stack) -> None:
     if found is not None:
         stack.annotate(order=found._replace(first=int(frames[found.first]))._asdict())
         return
-    odd = np.union1d(find_odd(seen, patterns, cells, parts), _beyond(seen, patterns, program, parts))
+    odd = find_odd(seen, patterns, cells, parts)
+    if ends is not None:
+        odd = np.union1d(odd, _beyond(seen, ends, parts))
     if odd.size <= MOST_ODD * sum(map(len, parts)):
         # Longer exposures, which clip, are not compared: those of a pattern were taken together.
         lost = np.setdiff1d(patterns[odd], np.delete(patterns, odd))
@@ -209,12 +213,19 @@ def _unit(values: Floats, axis: int) -> Floats:
     return unit
 
 
-def _beyond(seen: Floats, patterns: Integers, program: Program, parts: Sequence[Integers]) -> Integers:
+def _ends(patterns: Integers, program: Program) -> tuple[Integers, Integers] | None:
+    """The frames of the darkest and of the brightest constants; None if there are none of either."""
+    numbers, sent = program.constants
+    level = sent.sum(axis=1)
+    dark, bright = (
+        np.flatnonzero(np.isin(patterns, numbers[level == end])) for end in (level.min(), level.max())
+    )
+    return (dark, bright) if len(dark) and len(bright) else None
+
+
+def _beyond(seen: Floats, ends: tuple[Integers, Integers], parts: Sequence[Integers]) -> Integers:
     """The frames of random patterns that are brighter than white or darker than black where usual ones are not."""
-    ends = _ends(seen, patterns, program)
-    if ends is None:
-        return np.zeros(0, np.intp)
-    dark, bright = (np.median(frames, axis=0) for frames in ends)
+    dark, bright = (np.median(seen[frames], axis=0) for frames in ends)
     frames = np.concatenate(parts)
     room = BEYOND * np.maximum(bright - dark, 0)
     beyond = ((seen[frames] > bright + room) | (seen[frames] < dark - room)).mean(axis=1)
@@ -222,25 +233,11 @@ def _beyond(seen: Floats, patterns: Integers, program: Program, parts: Sequence[
     return odd
 
 
-def _constants_apart(seen: Floats, patterns: Integers, program: Program) -> tuple[Integers, float]:
+def _constants_apart(seen: Floats, ends: tuple[Integers, Integers]) -> tuple[Integers, float]:
     """The frames of black or of white, whichever differ more from each other, and the share of blocks that do."""
-    ends = _ends(seen, patterns, program)
-    if ends is None:
-        return np.zeros(0, np.intp), 0.0
-    white = float(np.quantile(np.median(ends[1], axis=0), BRIGHTEST))
-    shares = [float((np.ptp(frames, axis=0) > max(APART * white, FAINT)).mean()) for frames in ends]
-    numbers, sent = program.constants
-    level = sent.sum(axis=1)
-    end = (level.min(), level.max())[int(np.argmax(shares))]
-    return np.flatnonzero(np.isin(patterns, numbers[level == end])), max(shares)
-
-
-def _ends(seen: Floats, patterns: Integers, program: Program) -> tuple[Floats, Floats] | None:
-    """What blocks see of the darkest and of the brightest constants, (frames, n) each."""
-    numbers, sent = program.constants
-    level = sent.sum(axis=1)
-    dark, bright = (seen[np.isin(patterns, numbers[level == end])] for end in (level.min(), level.max()))
-    return (dark, bright) if len(dark) and len(bright) else None
+    white = float(np.quantile(np.median(seen[ends[1]], axis=0), BRIGHTEST))
+    shares = [float((np.ptp(seen[frames], axis=0) > max(APART * white, FAINT)).mean()) for frames in ends]
+    return ends[int(np.argmax(shares))], max(shares)
 
 
 def _light_of(stack: Stack) -> Floats | None:
