@@ -1,6 +1,6 @@
 """Metrics for Prometheus, from the database, so that every process of the service reports the same."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from fastapi import Request, Response
@@ -84,25 +84,21 @@ def _of_the_queue(connection: Connection) -> Iterator[Metric]:
 
 def _of_work(connection: Connection) -> Iterator[Metric]:
     """Work done so far."""
-    # From 0 on: Prometheus would not see a counter grow that begins with its first event.
     rows = {row.kind: row for row in statistics.work_totals(connection)}
     kinds = dict.fromkeys((*KINDS, *rows))  # a newer service may know others
-
-    def of_kinds(column: str) -> Labelled:
-        return [((kind,), getattr(rows.get(kind), column, 0)) for kind in kinds]
-
     steps = SummaryMetricFamily(
         "envmatte_tile_seconds", "Seconds that workers spent on finished tiles.", labels=["kind"]
     )
-    for (labels, tiles), (_, seconds) in zip(of_kinds("tiles"), of_kinds("seconds"), strict=True):
-        steps.add_metric(labels, int(tiles), seconds)
+    for kind in kinds:
+        row = rows.get(kind)
+        steps.add_metric((kind,), getattr(row, "tiles", 0), getattr(row, "seconds", 0))
     yield steps
     for name, column, text in (
         ("pixels", "pixels", "Pixels done: of frames ingested, mattes recovered and frames composited."),
         ("tile_failures", "misses", "Failed attempts at a tile or a step."),
         ("tile_losses", "losses", "Tiles and steps lost with their worker or in the store."),
     ):
-        yield _counter(name, text, ("kind",), of_kinds(column))
+        yield _counter(name, text, ("kind",), _of_each(kinds, rows, column))
 
 
 def _of_data(connection: Connection) -> Iterator[Metric]:
@@ -112,8 +108,7 @@ def _of_data(connection: Connection) -> Iterator[Metric]:
         ("captures", "number", "Captures by state."),
         ("capture_bytes", "bytes", "Bytes of the uploaded archives of captures."),
     ):
-        values = [((state,), getattr(rows.get(state), column, 0)) for state in CAPTURE_STATES]
-        yield _gauge(name, text, ("state",), values)
+        yield _gauge(name, text, ("state",), _of_each(CAPTURE_STATES, rows, column))
     found = statistics.matte_counts(connection)
     values = [((state,), found.get(state, 0)) for state in MATTE_STATES]
     yield _gauge("mattes", "Mattes by state.", ("state",), values)
@@ -144,6 +139,11 @@ def _of_the_cluster(connection: Connection) -> Iterator[Metric]:
 
 def _sum(workers: list[dict[str, Any]], name: str) -> int:
     return sum(worker[name] or 0 for worker in workers)
+
+
+def _of_each(keys: Iterable[str], rows: Mapping[str, Any], column: str) -> Labelled:
+    """A column of the rows of some keys; 0 without a row: Prometheus does not see a counter begin with an event."""
+    return [((key,), getattr(rows.get(key), column, 0)) for key in keys]
 
 
 def _gauge(name: str, text: str, labels: tuple[str, ...], found: Labelled) -> Metric:
