@@ -5,7 +5,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.browser.pages import MINUTE, ZIP
 from tests.end_to_end.conftest import Service, paused, serving
@@ -194,6 +194,28 @@ def test_activity_lists_the_last_jobs(desk: Page, service: Service, ready: tuple
     menu.get_by_role("link", name="All jobs").click()
     expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
     expect(menu).to_be_hidden()
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+def test_answer_about_the_matte_may_come_after_the_end(
+    desk: Page, service: Service, ready: tuple[str, str], leaves: bool
+) -> None:
+    asked: list[Route] = []
+    desk.route("**/v1/mattes/*", lambda route: asked.append(route))
+    with paused(service):
+        job = service.client.recover(ready[0], quality="fast")["id"]
+        desk.goto(f"{service.url}/#/jobs/{job}")
+        expect(desk.get_by_role("button", name="Cancel")).to_be_visible()
+    expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
+    while not asked:
+        desk.wait_for_timeout(50)
+    if leaves:
+        desk.get_by_role("link", name="Jobs").first.click()
+        expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
+    else:
+        asked[0].fulfill(json={"preview": True})
+        desk.wait_for_timeout(200)
+        expect(desk.get_by_role("button", name="Cancel")).to_be_hidden()  # the job is not running again
 
 
 @pytest.mark.parametrize("clicked", [True, False])

@@ -332,6 +332,7 @@ document.title = `${t("play.title")} · envmatte`;
 $("record").append(...parts("play.record", { record: h("a", { id: "capture", download: "capture.json" }, "capture.json"), film: h("code", "film.mp4"), name: h("code", "capture.json") }));
 $("checks").append(...checks().map((text) => Object.assign(document.createElement("li"), { textContent: text })));
 $("follow").href = new URL(`/#/film/${id}`, here);
+document.querySelector("main").hidden = false; // at once, since words that come later would shift what is below
 
 const start = () => open().catch((error) => setStatus(error.message));
 start();

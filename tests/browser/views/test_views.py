@@ -102,6 +102,17 @@ def test_every_view_is_accessible_and_stable(
                 assert_tab_reaches_everything(page, name)
 
 
+def test_words_of_the_player_that_come_late_shift_nothing(
+    browser: Browser, service: Service, views: dict[str, tuple[str, str]]
+) -> None:
+    with opened(browser, **DEVICES["phone"]) as page:
+        page.add_init_script(SHIFTS)
+        page.route("**/words/en.js", lambda route: (page.wait_for_timeout(500), route.continue_()))
+        go(page, service, views["play"])
+        shifts = page.evaluate("window.shifts")
+        assert sum(shift[0] for shift in shifts) < MAX_SHIFT, shifts
+
+
 def assert_tab_reaches_everything(page: Page, name: str) -> None:
     expected = page.evaluate(
         """() => {

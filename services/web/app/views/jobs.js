@@ -57,20 +57,26 @@ export async function job(main, signal, id) {
 	);
 	let hasPreview = false; // the matte, from some moment of its recovery on
 	let looked;
+	let latest;
 	watch(found);
 
-	async function lookForPreview(now) {
-		hasPreview = Boolean((await getJson(`v1/mattes/${now.matte}`, signal)).preview);
-		if (hasPreview) update(now);
+	async function lookForPreview() {
+		try {
+			hasPreview = Boolean((await getJson(`v1/mattes/${found.matte}`, signal)).preview);
+			if (hasPreview) update(latest);
+		} catch {
+			looked = null; // the next event looks again
+		}
 	}
 
 	function update(now) {
+		latest = now;
 		halt.update(now);
 		cancel.hidden = !ACTIVE.includes(now.state);
 		removal.hidden = ACTIVE.includes(now.state);
 		retry.hidden = now.state !== "failed";
 		const made = now.state === "succeeded";
-		if (now.stage === "recovering") looked ??= lookForPreview(now);
+		if (now.stage === "recovering") looked ??= lookForPreview();
 		const isShown = made || (hasPreview && now.state === "running");
 		if (isShown && automatic.delete(id)) return location.replace(`#/mattes/${now.matte}`);
 		links.replaceChildren(...[
