@@ -10,8 +10,8 @@ from starlette.requests import Request
 from services.api.captures import tus
 from services.api.http.media_types import preferred, require_media_type
 from services.api.http.responses import etag_matches
-from services.api.mattes import clips as clips_api
-from services.api.mattes import composites as composites_api
+from services.api.mattes.composites import clips as clips_api
+from services.api.mattes.composites import composites as composites_api
 from services.runtime.tracing import TRACEPARENT
 from services.webhooks import safe_http
 from storage.errors import InvalidInput

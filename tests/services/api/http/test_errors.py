@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from services.api.http.bodies import read_json
 from services.api.http.errors import register
-from services.api.mattes.composite_params import CompositeParams
+from services.api.mattes.composites.params import CompositeParams
 from services.api.mattes.links import LinkRequest
 from services.api.programs.programs import PlaybackState, ProgramRequest
 from services.runtime.problems import Unauthorized

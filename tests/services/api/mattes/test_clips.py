@@ -2,7 +2,7 @@
 
 import pytest
 
-from services.api.mattes.clips import _span
+from services.api.mattes.composites.clips import _span
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,8 @@ import uvicorn
 from sqlalchemy import Engine
 
 from services.api.app import BACKDROPS, build_app
-from services.api.mattes import composites, layers
+from services.api.mattes import layers
+from services.api.mattes.composites import composites
 from services.settings import Settings
 from storage.database.engine import writing
 from storage.database.owners import for_owner

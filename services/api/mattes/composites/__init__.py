@@ -1,0 +1,1 @@
+"""Composites over HTTP: of pictures at once, of clips as jobs."""
