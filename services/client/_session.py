@@ -39,6 +39,11 @@ class Session:
     key : str, optional
         API key.
 
+    Attributes
+    ----------
+    answered : bool
+        Whether a request has succeeded.
+
     Raises
     ------
     ValueError
@@ -58,7 +63,7 @@ class Session:
         if base.scheme not in ("http", "https") or not base.host:
             raise ValueError(f"{url!r} is not the URL of a service: give it as http://HOST:PORT")
         self._http = httpx2.Client(base_url=base, headers=headers, timeout=SILENCE)
-        self._answered = False
+        self.answered = False
 
     def url_of(self, path: str) -> str:
         """The whole URL of a path of the service."""
@@ -99,7 +104,7 @@ class Session:
             try:
                 return call()
             except (Unreachable, Busy) as error:
-                again = error.status == 429 or (safe and (self._answered or error.retry_after is not None))
+                again = error.status == 429 or (safe and (self.answered or error.retry_after is not None))
                 # Random, so that many clients do not retry at the same moment.
                 wait = max(error.retry_after or 0.0, pause * random.uniform(0.5, 1))
                 if not again or time.monotonic() + wait > give_up:
@@ -142,7 +147,7 @@ class Session:
                     answer.read()
                     raise _refusal(method, answer)
                 yield answer
-                self._answered = True
+                self.answered = True
         except httpx2.TransportError as error:
             url = self._http.base_url
             problem = {"title": "No answer", "status": 503}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from services.client._errors import FileChanged, NotFound, ServiceError, Unreachable
+from services.client._errors import Busy, FileChanged, NotFound, ServiceError, Unreachable
 
 if TYPE_CHECKING:
     import httpx2
@@ -78,9 +78,13 @@ def send(
                     raise
                 offset = size  # another process may have finished this upload: then the capture exists
             except ServiceError as error:
-                never_answered = isinstance(error, Unreachable) and not where
+                # As for other calls: is there a service? One that is busy says when to try again.
+                there = http.answered and isinstance(error, Unreachable | Busy)
+                hopeless = (
+                    not (where or there) and error.status in (502, 503, 504) and error.retry_after is None
+                )
                 wait = max(pause, error.retry_after or 0.0)
-                if never_answered or error.status not in TEMPORARY or time.monotonic() + wait > give_up:
+                if hopeless or error.status not in TEMPORARY or time.monotonic() + wait > give_up:
                     raise
                 time.sleep(wait)
                 step, pause = max(step // 2, SMALLEST), min(2 * pause, _session.LONGEST_PAUSE)

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from services.client import _upload
+from services.client import Client, ServiceError, _upload
 from services.client._session import PATIENCE, Session
-from tests.services.client.servers import web_server
+from tests.services.client.servers import scripted_server, web_server
 
 MOST = 64 << 10
 """Bytes of a request that come through."""
@@ -59,3 +59,16 @@ def test_requests_get_smaller_until_they_come_through_and_larger_again(
     fails, comes = 2 * MOST, MOST
     assert sizes == [2 * fails, fails, *3 * [comes, fails], comes, comes]
     assert waits[1] > waits[0] == waits[2]
+
+
+@pytest.mark.parametrize("status", [200, 502])
+def test_what_is_no_service_is_asked_once(tmp_path: Path, status: int) -> None:
+    answer = status, {"Content-Type": "text/html"}, b"<html>"
+    (tmp_path / "ball.zip").write_bytes(b"ball")
+    with (
+        scripted_server(lambda n: answer) as (url, calls),
+        Client(url) as client,
+        pytest.raises(ServiceError),
+    ):
+        client.upload(tmp_path / "ball.zip")
+    assert len(calls) == 1
