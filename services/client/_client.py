@@ -38,7 +38,7 @@ class Client:
     Raises
     ------
     ValueError
-        If the URL is not an HTTP URL.
+        If the URL is not an HTTP URL, or a proxy that the environment names can't be used.
     InvalidKey
         If the key can't be sent.
 

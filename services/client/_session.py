@@ -2,6 +2,7 @@
 
 import logging
 import random
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -25,6 +26,8 @@ COMPUTING = 600.0
 """The same for answers that the service computes before their first byte."""
 SAFE = ("GET", "HEAD", "PUT", "DELETE")
 """Idempotent methods (RFC 9110, sect. 9.2.2)."""
+LOOPBACK = re.compile(r"localhost|127(\.\d+){3}|::1")
+"""Hosts of this machine; the client imports nothing that `services.runtime.addresses` does."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
 """Seconds between two attempts; the pause doubles with each."""
 
@@ -47,7 +50,7 @@ class Session:
     Raises
     ------
     ValueError
-        If the URL is not an HTTP URL.
+        If the URL is not an HTTP URL, or a proxy that the environment names can't be used.
     InvalidKey
         If the key can't be sent.
     """
@@ -62,7 +65,15 @@ class Session:
             base = httpx2.URL("")
         if base.scheme not in ("http", "https") or not base.host:
             raise ValueError(f"{url!r} is not the URL of a service: give it as http://HOST:PORT")
-        self._http = httpx2.Client(base_url=base, headers=headers, timeout=SILENCE)
+        # A proxy of the environment may be on another machine, for which loopback is itself.
+        direct = base.scheme == "http" and LOOPBACK.fullmatch(base.host) is not None
+        try:
+            self._http = httpx2.Client(base_url=base, headers=headers, timeout=SILENCE, trust_env=not direct)
+        except (ValueError, ImportError, httpx2.InvalidURL) as error:
+            raise ValueError(
+                "one of the proxies that HTTP_PROXY, HTTPS_PROXY and ALL_PROXY name can't be used: name an HTTP proxy, "
+                f"or unset the variable ({error})"
+            ) from error
         self.answered = False
 
     def url_of(self, path: str) -> str:

@@ -162,6 +162,29 @@ def test_another_web_server_is_recognised() -> None:
         client.job("j")
 
 
+@pytest.mark.parametrize("proxy", ["http://127.0.0.1:9", "socks://127.0.0.1:9", "nonsense:proxy"])
+def test_service_on_loopback_is_reached_without_a_proxy(monkeypatch: pytest.MonkeyPatch, proxy: str) -> None:
+    for name in ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"):
+        monkeypatch.setenv(name, proxy)
+    with scripted_server(lambda n: ok()) as (url, _), Client(url) as client:
+        assert client.job("j").id == "j"
+
+
+def test_service_elsewhere_is_reached_by_a_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    with scripted_server(lambda n: ok()) as (proxy, calls):
+        monkeypatch.setenv("HTTP_PROXY", proxy)
+        with Client("http://glass.example") as client:
+            assert client.job("j").id == "j"
+    assert calls[0]["call"] == "GET http://glass.example/v1/jobs/j"
+
+
+@pytest.mark.parametrize("proxy", ["socks://127.0.0.1:9", "socks5://127.0.0.1:9", "nonsense:proxy"])
+def test_proxy_that_is_no_http_proxy_is_named(monkeypatch: pytest.MonkeyPatch, proxy: str) -> None:
+    monkeypatch.setenv("ALL_PROXY", proxy)
+    with pytest.raises(ValueError, match=r"HTTPS_PROXY and ALL_PROXY .* unset"):
+        Client("https://glass.example")
+
+
 @pytest.mark.parametrize("url", ["localhost:8000", "ftp://x", "http://", ""])
 def test_invalid_url_is_refused(url: str) -> None:
     with pytest.raises(ValueError, match="http://HOST:PORT"):
