@@ -194,6 +194,8 @@ def _refusal(method: str, answer: httpx2.Response) -> ServiceError:
             return kind(found | {"status": answer.status_code}, retry_after)
     # From a proxy, cut off, or in answer to HEAD.
     detail = f"{method} {answer.url} was answered with {answer.status_code} {answer.reason_phrase}"
+    if answer.has_redirect_location:  # not followed: the key would go wherever it leads
+        detail += f"; check the URL of the service, the answer leads to {answer.headers['Location']}"
     problem = {"title": answer.reason_phrase, "status": answer.status_code, "detail": detail}
     return kind(problem, retry_after)
 

@@ -162,6 +162,17 @@ def test_another_web_server_is_recognised() -> None:
         client.job("j")
 
 
+def test_redirect_says_where_it_leads() -> None:
+    answer = 301, {"Location": "https://glass.example/v1/jobs/j"}, b""
+    with (
+        scripted_server(lambda n: answer) as (url, calls),
+        Client(url) as client,
+        pytest.raises(ServiceError, match=r"301 .* leads to https://glass\.example/v1/jobs/j"),
+    ):
+        client.job("j")
+    assert len(calls) == 1
+
+
 @pytest.mark.parametrize("proxy", ["http://127.0.0.1:9", "socks://127.0.0.1:9", "nonsense:proxy"])
 def test_service_on_loopback_is_reached_without_a_proxy(monkeypatch: pytest.MonkeyPatch, proxy: str) -> None:
     for name in ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"):
