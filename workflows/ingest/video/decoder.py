@@ -165,9 +165,9 @@ class Clip:
         return np.array(found, np.int64), last or (found[-1] - found[-2] if len(found) > 1 else 1)
 
     def _open(self) -> VideoStream:
-        if not self._container.streams.video:
+        stream = self._container.streams.best("video")  # the others are covers and previews
+        if not isinstance(stream, VideoStream):
             raise CaptureError(f"{self.entry} has no video in it", entry=self.entry)
-        stream = self._container.streams.video[0]
         codec: Any = stream.codec_context
         if codec is None or codec.name not in CODECS:
             name = "an unknown codec" if codec is None else codec.name

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -109,6 +110,24 @@ def test_picture_is_no_film_of_one_frame() -> None:
     picture = heic(np.zeros((64, 64, 3), np.uint8))
     with pytest.raises(CaptureError, match=r"IMG_1\.HEIC is a picture in HEIC, not a film"):
         Clip(io.BytesIO(picture), "IMG_1.HEIC", 1 << 20)
+
+
+@pytest.mark.parametrize("count", [1, 20])
+def test_cover_or_preview_before_the_film_is_left_out(count: int) -> None:
+    frames = pictures(20)
+    target = io.BytesIO()
+    with av.open(target, "w", format="matroska") as box:
+        cover, film = box.add_stream("mjpeg", rate=10), box.add_stream("libx264", rate=10)
+        cover.width, cover.height, cover.pix_fmt = 16, 12, "yuvj420p"
+        film.height, film.width = frames[0].shape[:2]
+        film.pix_fmt = "yuv420p"
+        for stream, shown in ((cover, [np.zeros((12, 16, 3), np.uint8)] * count), (film, frames)):
+            for picture in shown:
+                box.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+            box.mux(stream.encode(None))
+    with closing(Clip(target, "clip", 1 << 24)) as read:
+        assert read.size == (film.width, film.height)
+        assert len(list(read.frames())) == len(frames)
 
 
 @pytest.mark.slow
