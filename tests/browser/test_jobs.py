@@ -132,6 +132,7 @@ def test_job_is_followed_again_after_sleep(desk: Page, service: Service, ready: 
         while len(requests) == 1:
             desk.wait_for_timeout(100)
         assert requests[1]  # resumes after the last event received
+        expect(desk.locator(".stage .badge")).to_have_text("running")  # though there is no new one
     expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
 
 
@@ -194,6 +195,25 @@ def test_activity_lists_the_last_jobs(desk: Page, service: Service, ready: tuple
     menu.get_by_role("link", name="All jobs").click()
     expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
     expect(menu).to_be_hidden()
+
+
+def test_count_of_the_activity_is_right_after_an_outage(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    desk.clock.install()
+    with paused(service):
+        job = service.client.recover(ready[0])["id"]
+        desk.goto(f"{service.url}/#/captures")
+        activity = desk.get_by_role("button", name="Activity")
+        expect(activity).to_contain_text("1")
+        desk.route("**/v1/jobs?*", lambda route: route.abort("connectionreset"))
+        with desk.expect_console_message(lambda message: "ERR_CONNECTION_RESET" in message.text):
+            desk.clock.fast_forward(5000)
+        desk.wait_for_timeout(1000)  # it is asked for twice
+        service.http.post(f"/v1/jobs/{job}/cancel")
+        desk.unroute("**/v1/jobs?*")
+        desk.clock.fast_forward(5000)
+        expect(activity).not_to_contain_text("1")
 
 
 @pytest.mark.parametrize("leaves", [True, False])

@@ -67,7 +67,7 @@ async function route(navigated) {
 		const final = error.status >= 400 && error.status < 500 && error.status !== 401;
 		const again = !final && h("p", h("button", { type: "button", onclick: () => route(true) }, t("again")));
 		if (!view.signal.aborted) view.element.append(problemBox(error), again || "");
-		if (error.status === 0) returned(view.signal).then(() => route(false), () => {}); // the user left the view
+		if (error.isTemporary) returned(view.signal).then(() => route(false), () => {}); // the user left the view
 	}
 	if (view !== shown) return;
 	main.ariaBusy = "false";

@@ -274,3 +274,15 @@ def test_another_upload_does_not_end_a_recording(desk: Page, service: Service, b
     expect(row).to_be_hidden(timeout=MINUTE)
     desk.wait_for_timeout(500)
     expect(desk.get_by_role("button", name="Stop recording")).to_be_visible()
+
+
+def test_outage_is_said_while_a_program_is_followed(desk: Page, service: Service) -> None:
+    made = service.http.post("/v1/programs", json={"program": SHORT, "monitor": SCREEN}).json()
+    desk.route("**/v1/programs/*/events", lambda route: route.abort("connectionreset"))
+    desk.goto(f"{service.url}/#/film/{made['id']}")
+    away = desk.get_by_text("The service does not answer; trying again.")
+    expect(away).to_be_visible()
+    desk.wait_for_timeout(600)  # more than twice as long as between two drawings of the progress
+    assert away.is_visible()
+    desk.unroute("**/v1/programs/*/events")
+    expect(desk.get_by_text("Open the player on the monitor")).to_be_visible()

@@ -52,7 +52,10 @@ def test_glass_is_in_the_hand_before_it_is_recovered(desk: Page, service: Servic
         desk.get_by_role("button", name="Pause").click()
         desk.get_by_role("button", name="Continue").click()
         expect(desk.get_by_role("button", name="Pause")).to_be_visible()
-    expect(desk.get_by_role("button", name="Download the matte")).to_be_visible(timeout=2 * MINUTE)
+        desk.route(f"**/v1/mattes/{job['matte']}", lambda route: route.abort("connectionreset"))
+    expect(desk.get_by_role("alert")).to_contain_text("The service does not answer", timeout=2 * MINUTE)
+    desk.unroute(f"**/v1/mattes/{job['matte']}")
+    expect(desk.get_by_role("button", name="Download the matte")).to_be_visible()
     expect(desk.get_by_role("heading", name="Layers")).to_be_visible()
     expect(desk.get_by_text("This browser draws the glass while you move; when")).to_be_visible()
     assert "right=" in desk.url  # the placement stays

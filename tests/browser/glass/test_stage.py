@@ -223,3 +223,18 @@ def test_refused_picture_is_said_not_to_be_shown(
     expect(desk.get_by_role("alert")).to_contain_text("The image can't be used")
     expect(desk.get_by_text("beach.png: not shown")).to_be_visible()
     assert desk.locator(".picture.stage img").get_attribute("src") == before
+
+
+def test_picture_comes_back_by_itself_after_an_outage(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    for path in ("live", "composite?*"):
+        desk.route(f"**/v1/mattes/*/{path}", lambda route: route.abort("connectionreset"))
+    desk.goto(f"{service.url}/#/mattes/{ready[1]}")
+    expect(desk.get_by_role("alert")).to_contain_text("The service does not answer")
+    expect(desk.get_by_text("not shown")).to_be_visible()
+    for path in ("live", "composite?*"):
+        desk.unroute(f"**/v1/mattes/*/{path}")
+    expect(desk.get_by_text("exact")).to_be_visible()
+    expect(desk.get_by_text("This browser draws the glass while you move")).to_be_visible()
+    expect(desk.get_by_role("alert")).to_have_count(0)

@@ -150,6 +150,18 @@ def test_picture_stands_in_while_the_glass_is_loading(desk: Page, service: Servi
 
 
 @pytest.mark.slow
+def test_sample_that_does_not_come_is_explained_until_another_does(desk: Page, service: Service) -> None:
+    desk.goto(service.url)
+    expect(desk.get_by_role("heading", name=NAMES[0])).to_be_visible()
+    desk.route("**/*.live", lambda route: route.abort("connectionreset"))
+    desk.get_by_role("radio", name=NAMES[1]).check()
+    expect(desk.get_by_role("alert")).to_contain_text("The service does not answer")
+    desk.unroute("**/*.live")
+    desk.get_by_role("radio", name=NAMES[2]).check()
+    expect(desk.get_by_role("alert")).to_have_count(0)
+
+
+@pytest.mark.slow
 def test_samples_are_removed_and_restored(desk: Page, service: Service) -> None:
     desk.goto(service.url)
     desk.get_by_role("button", name="Remove the samples").click()

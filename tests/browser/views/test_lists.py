@@ -1,5 +1,6 @@
 """Lists: searched, filtered, and cleared of several entries at once, which can be undone."""
 
+import re
 from collections.abc import Callable
 from urllib.parse import parse_qs, urlsplit
 
@@ -90,8 +91,33 @@ def test_names_are_searched(desk: Page, service: Service, ready: tuple[str, str]
     expect(found).to_be_visible()
 
 
-def test_search_looks_into_all_pages(desk: Page, service: Service) -> None:
-    """A service with 120 captures, as far as the app can tell, which finds them by name."""
+@pytest.mark.parametrize("outage", ["no connection", "a proxy alone", "another page"])
+def test_list_comes_back_by_itself_after_an_outage(
+    desk: Page, service: Service, ready: tuple[str, str], outage: str
+) -> None:
+    def fail(route: Route) -> None:
+        if outage == "no connection":
+            route.abort("connectionreset")
+        elif outage == "a proxy alone":
+            route.fulfill(status=502)
+        else:  # as of the login of a hotel
+            route.fulfill(body="<html>", content_type="text/html")
+
+    desk.route("**/v1/captures?*", fail)
+    desk.route("**/thumbnail.png", lambda route: route.abort("connectionreset"))
+    desk.goto(f"{service.url}/#/captures")
+    expect(desk.get_by_role("main").get_by_role("alert")).to_be_visible()
+    desk.unroute("**/v1/captures?*")
+    entry = desk.locator(f'a[href="#/captures/{ready[0]}"]')
+    expect(entry).to_be_visible()
+    expect(desk.get_by_role("main").get_by_role("alert")).to_have_count(0)
+    desk.unroute("**/thumbnail.png")
+    expect(entry.locator("img")).to_be_visible()
+
+
+@pytest.fixture
+def asked(desk: Page) -> list[dict[str, list[str]]]:
+    """The queries to a service with 120 captures, as far as the app can tell, which finds them by name."""
     captures = [
         {
             "id": f"c{n:03}",
@@ -114,6 +140,10 @@ def test_search_looks_into_all_pages(desk: Page, service: Service) -> None:
 
     desk.route("**/v1/captures?*", answer)
     desk.route("**/v1/captures/*/thumbnail.png", lambda route: route.fulfill(status=404, json=NOT_NOW))
+    return asked
+
+
+def test_search_looks_into_all_pages(desk: Page, service: Service, asked: list[dict[str, list[str]]]) -> None:
     desk.goto(f"{service.url}/#/captures")
     entries = desk.get_by_role("main").locator("ul.list > li")
     expect(entries).to_have_count(50)
@@ -131,6 +161,21 @@ def test_search_looks_into_all_pages(desk: Page, service: Service) -> None:
     expect(entries).to_have_count(50)
     desk.get_by_role("button", name="Show older").click()
     expect(entries).to_have_count(100)
+
+
+def test_search_wins_over_older_entries_that_come_late(
+    desk: Page, service: Service, asked: list[dict[str, list[str]]]
+) -> None:
+    held: list[Route] = []
+    desk.route(re.compile("after="), lambda route: held.append(route))
+    desk.goto(f"{service.url}/#/captures")
+    entries = desk.get_by_role("main").locator("ul.list > li")
+    desk.get_by_role("button", name="Show older").click()
+    desk.get_by_role("searchbox", name="Search").fill("glass 11")
+    desk.wait_for_timeout(500)
+    held[0].fallback()
+    desk.wait_for_timeout(500)
+    expect(entries).to_have_count(10)
 
 
 def test_deletion_is_undone(desk: Page, service: Service, cancelled: list[str]) -> None:

@@ -49,10 +49,10 @@ def test_sentences_begin_with_a_capital_and_names_stay(
 
 
 def test_list_that_failed_can_be_tried_again(desk: Page, service: Service, ready: tuple[str, str]) -> None:
-    desk.route("**/v1/mattes?*", lambda route: route.abort("connectionreset"))
+    desk.route("**/v1/mattes?*", lambda route: route.fulfill(status=500))
     desk.goto(f"{service.url}/#/mattes")
     again = desk.get_by_role("button", name="Try again")
-    expect(desk.get_by_role("alert")).to_contain_text("The service does not answer")
+    expect(desk.get_by_role("alert")).to_contain_text("The service answered with 500")
     again.click()
     expect(again).to_be_enabled()
     desk.unroute("**/v1/mattes?*")

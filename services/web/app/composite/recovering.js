@@ -18,16 +18,21 @@ export function recovering(matte, stage, signal, done) {
 		stage.renew();
 		await pause(LOOK, signal).catch(() => {});
 	});
-	followJob(progress, matte.job, signal, async (job) => {
+	followJob(progress, matte.job, signal, (job) => {
 		halt.update(job);
 		region.hidden = job.state !== "running";
-		if (job.state === "running") return look();
-		if (job.state !== "succeeded") return;
+		if (job.state === "running") look();
+	}).then(async ({ state }) => {
+		if (state !== "succeeded") return;
 		Object.assign(matte, await getJson(`v1/mattes/${matte.id}`, signal));
 		stage.fetch();
 		stage.renew(); // also where this browser cannot draw the glass
 		done();
-	}).catch((error) => signal.aborted || problem.replaceChildren(problemBox(error)));
+	}).catch((error) => {
+		if (signal.aborted) return;
+		if (error.isTemporary) dispatchEvent(new HashChangeEvent("hashchange")); // shows the view once the service answers again
+		else problem.replaceChildren(problemBox(error));
+	});
 	return h("section.panel", { "aria-label": t("progress") }, h("p", t("matte.preview")), h("p.row", halt.button, region), progress, problem);
 }
 

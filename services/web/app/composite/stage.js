@@ -1,12 +1,13 @@
 // The picture of the glass. While something moves, this browser draws it, or the service composites a small picture; then
 // the service's composite at full size is shown.
-import { ask, getComposite } from "../lib/api.js";
-import { h, newest, problemBox, show } from "../lib/dom.js";
+import { ask, getComposite, received } from "../lib/api.js";
+import { h, newest, pause, problemBox, show } from "../lib/dom.js";
 import { decodeLive } from "./live/live_form.js";
 import { LiveGlass } from "./live/live_glass.js";
 import { t } from "../lib/words.js";
 
 const QUICK = 480; // pixels of the longer side of a preview
+const RETRY = 5000; // ms
 
 // Its element sends `moved` before a change, `exact` when the picture shows it at full size, and `unmasked` if there is
 // nothing that a mask left out.
@@ -35,9 +36,16 @@ export class Stage extends LiveGlass {
 
 	fail = (error) => {
 		if (this.signal.aborted) return;
-		this.problem.replaceChildren(problemBox(error));
+		const box = problemBox(error);
+		if (box.textContent === this.problem.textContent) return; // it was tried again
+		this.problem.replaceChildren(box);
 		this.problem.scrollIntoView({ block: "nearest" });
 	};
+
+	// Tries again later what failed, if that may help.
+	#later(error, work) {
+		if (error.isTemporary) pause(RETRY, this.signal).then(work, () => {}); // the user left the view
+	}
 
 	// False if the backdrop cannot be used.
 	async use(promise) {
@@ -128,6 +136,7 @@ export class Stage extends LiveGlass {
 			if (error.name !== "AbortError") {
 				this.#describe(t(this.isLive ? "stage.live" : "stage.failed"));
 				this.fail(error);
+				if (exact) this.#later(error, () => changes === this.#changes && this.#composite(true));
 			}
 		}
 		if (!exact && this.playing && !this.isLive && !this.signal.aborted) this.#composite(false); // the next frame
@@ -168,7 +177,7 @@ export class Stage extends LiveGlass {
 		const say = (text) => (this.renderer.textContent = text);
 		if (!this.gl) return say(t("stage.nogl"));
 		try {
-			const found = decodeLive(await (await ask(`v1/mattes/${this.#matte.id}/live`, { signal: this.signal })).arrayBuffer());
+			const found = decodeLive(await received((await ask(`v1/mattes/${this.#matte.id}/live`, { signal: this.signal })).arrayBuffer(), this.signal));
 			if (!this.load(found, this.#matte.monitor)) {
 				if (this.gl) say(t("stage.toolarge"));
 				return;
@@ -176,6 +185,7 @@ export class Stage extends LiveGlass {
 			if (!found.isMasked) this.element.dispatchEvent(new Event("unmasked"));
 			const step = found.step * (this.#matte.preview ?? 1);
 			say(t(step > 1 ? "stage.some" : "stage.all", { n: step ** 2 }));
+			if (this.isExact) this.problem.replaceChildren();
 			if (!this.backdrop || this.isExact) return;
 			if (this.playing) return this.moved();
 			// Something was moved meanwhile: the exact picture is on its way.
@@ -183,6 +193,7 @@ export class Stage extends LiveGlass {
 			this.request();
 		} catch (error) {
 			this.fail(error);
+			this.#later(error, () => this.fetch());
 		}
 	}
 

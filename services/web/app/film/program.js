@@ -104,10 +104,11 @@ export async function program(main, signal, id) {
 	);
 	let since = performance.now();
 	const age = () => (found.showing?.age_seconds ?? 0) + (performance.now() - since) / 1000;
+	let isAway = false;
 	const draw = () => {
 		const now = describe(found, age());
 		if (phase.textContent !== now.phase) phase.textContent = now.phase;
-		about.textContent = now.about;
+		about.textContent = isAway ? t("film.away") : now.about;
 		bar.value = now.shown;
 	};
 	const changed = (now) => {
@@ -117,7 +118,10 @@ export async function program(main, signal, id) {
 		if (reported === "countdown" && age() < SILENT) recorder?.start();
 		if (reported === "shown" || reported === "stopped") recorder?.stop(reported === "shown");
 	};
-	const lost = (away) => away && (about.textContent = t("film.away"));
+	const lost = (away) => {
+		isAway = away;
+		draw();
+	};
 	follow(`v1/programs/${id}/events`, signal, changed, { lost }).catch((error) => signal.aborted || live.append(problemBox(error)));
 	(async () => {
 		for (;;) {

@@ -29,6 +29,7 @@ export async function home(main, signal) {
 	async function show(sample) {
 		title.textContent = titleOf(sample);
 		about.textContent = `${aboutOf(sample)}. ${glass.gl ? t("home.drag") : ""}`;
+		problem.replaceChildren();
 		await glass.show(sample).catch(fail);
 	}
 	let used; // the control of the backdrop that is shown

@@ -1,5 +1,5 @@
 // The samples that come with the app: glass that was traced, filmed and recovered by `workflows/simulation/samples.py`.
-import { Problem } from "../lib/api.js";
+import { Problem, received } from "../lib/api.js";
 import { decodeLive } from "../composite/live/live_form.js";
 import { known, t } from "../lib/words.js";
 
@@ -16,7 +16,7 @@ export const still = ({ name }) => `${FOLDER}${name}.webp`;
 
 // Fetches a file of the app itself, which needs no key.
 async function fetchFile(name, signal) {
-	const answer = await fetch(FOLDER + name, { signal });
+	const answer = await received(fetch(FOLDER + name, { signal }), signal);
 	if (!answer.ok) throw new Problem({ title: t("sample.missing"), detail: t("sample.file", { name }), status: answer.status });
 	return answer;
 }
@@ -25,9 +25,9 @@ export const fetchSamples = async (signal) => (await fetchFile("samples.json", s
 
 export async function fetchSample({ name }, signal) {
 	const { body } = await fetchFile(`${name}.live`, signal);
-	return decodeLive(await new Response(body.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer());
+	return decodeLive(await received(new Response(body.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer(), signal));
 }
 
 export async function fetchCapture(signal) {
-	return new File([await (await fetchFile("capture.zip", signal)).blob()], "sample-tumbler.zip", { type: "application/zip" });
+	return new File([await received((await fetchFile("capture.zip", signal)).blob(), signal)], "sample-tumbler.zip", { type: "application/zip" });
 }

@@ -20,7 +20,7 @@ export const jobCard = (job, ...more) =>
 
 export const refreshActivity = newest(async () => {
 	clearTimeout(timer);
-	const { jobs } = await getJson(`v1/jobs?limit=${SHOWN}`).catch(() => ({}));
+	const { jobs, isTemporary } = await getJson(`v1/jobs?limit=${SHOWN}`).catch((error) => ({ isTemporary: error.isTemporary }));
 	const isOpen = menu.matches(":popover-open");
 	if (jobs) {
 		const active = jobs.filter(({ state }) => ACTIVE.includes(state)).length;
@@ -32,7 +32,7 @@ export const refreshActivity = newest(async () => {
 		if (focused) menu.querySelector(`[href="${focused}"]`)?.focus();
 		if (!active && !isOpen) return;
 	}
-	if (jobs || isOpen) timer = setTimeout(refreshActivity, REFRESH);
+	if (jobs || isOpen || (isTemporary && count.textContent)) timer = setTimeout(refreshActivity, REFRESH);
 });
 
 menu.addEventListener("toggle", ({ newState }) => {

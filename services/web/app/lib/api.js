@@ -3,12 +3,18 @@
 import { pause } from "./dom.js";
 import { t } from "./words.js";
 
+const TEMPORARY = [0, 429, 502, 503, 504]; // the service is unreachable, busy or starting
 const KEY = "envmatte-key"; // the player page keeps it under the same name
 
 export class Problem extends Error {
 	constructor({ title, detail, status, field, entry, limit }) {
 		super(detail);
 		Object.assign(this, { title, detail, status, field, entry, limit });
+	}
+
+	// Whether the same request may succeed later, without a change.
+	get isTemporary() {
+		return TEMPORARY.includes(this.status);
 	}
 }
 
@@ -53,16 +59,16 @@ async function fetchTwice(path, options) {
 	}
 }
 
+// What a connection brings, an answer or its body; throws a Problem if it breaks.
+export const received = (promise, signal) => promise.catch(() => {
+	throw signal?.aborted ? signal.reason : unreachable();
+});
+
 // Requests a path: resolves with the response, or throws a Problem as the API words it. Asks for a key where needed.
 export async function ask(path, options = {}) {
 	for (;;) {
 		const used = key();
-		let answer;
-		try {
-			answer = await fetchTwice(path, { ...options, headers: { ...options.headers, ...authorization() } });
-		} catch (error) {
-			throw options.signal?.aborted ? options.signal.reason : unreachable();
-		}
+		const answer = await received(fetchTwice(path, { ...options, headers: { ...options.headers, ...authorization() } }), options.signal);
 		if (answer.ok) return answer;
 		const problem = new Problem(await describe(answer));
 		if (answer.status !== 401) throw problem;
@@ -76,24 +82,24 @@ async function describe(answer) {
 	return { title: answer.statusText || t("refused"), detail: t("answered", { status: answer.status }), ...about, status: answer.status };
 }
 
-export const getJson = async (path, signal) => (await ask(path, { signal })).json();
+export const getJson = async (path, signal) => received((await ask(path, { signal })).json(), signal);
 
-export const getBlob = async (path, signal) => (await ask(path, { signal })).blob();
+export const getBlob = async (path, signal) => received((await ask(path, { signal })).blob(), signal);
 
 export const getComposite = async (id, query, type, body, signal) =>
-	(await ask(`v1/mattes/${id}/composite?${new URLSearchParams(query)}`, { method: "POST", headers: { Accept: type }, body, signal })).blob();
+	received((await ask(`v1/mattes/${id}/composite?${new URLSearchParams(query)}`, { method: "POST", headers: { Accept: type }, body, signal })).blob(), signal);
 
 export const newKey = () => crypto.randomUUID?.() ?? String(Math.random());
 
 // Posts JSON with an Idempotency-Key: a double click or a retry creates one thing.
 export async function post(path, body, once = newKey()) {
 	const headers = { "Content-Type": "application/json", "Idempotency-Key": once };
-	return (await ask(path, { method: "POST", headers, body: JSON.stringify(body) })).json();
+	return received((await ask(path, { method: "POST", headers, body: JSON.stringify(body) })).json());
 }
 
 const send = (method, path, body) => ask(path, { method, headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
 
-export const patchJson = async (path, body) => (await send("PATCH", path, body)).json();
+export const patchJson = async (path, body) => received((await send("PATCH", path, body)).json());
 
 export const putJson = (path, body) => send("PUT", path, body);
 

@@ -38,11 +38,13 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 		[t("job.waited")]: job.queued_seconds >= 1 ? duration(job.queued_seconds) : null,
 	}));
 	let tick; // goes on while no event comes
+	let latest;
 	const update = (job) => {
+		latest = job;
 		const active = ACTIVE.includes(job.state);
 		const now = performance.now();
 		clearInterval(tick);
-		if (job.state === "running" && !job.paused) tick = setInterval(() => signal.aborted ? clearInterval(tick) : show(job, (performance.now() - now) / 1000), TICK);
+		if (job.state === "running" && !job.paused) tick = setInterval(() => show(job, (performance.now() - now) / 1000), TICK);
 		bar.value = job.progress;
 		if (job.state === "running" && job.stage === "finishing") bar.removeAttribute("value"); // it has no parts to count
 		bar.hidden = !active && job.state !== "failed";
@@ -56,12 +58,14 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 	};
 	if (known) update(known);
 	const lost = (away) => {
+		const wasAway = panel.classList.contains("lost");
 		panel.classList.toggle("lost", away);
-		if (!away) return;
-		clearInterval(tick);
-		stage.textContent = t("job.away");
+		if (away) {
+			clearInterval(tick);
+			stage.textContent = t("job.away");
+		} else if (wasAway && latest) update(latest); // an event comes only once something changes
 	};
-	return follow(`v1/jobs/${id}/events`, signal, update, { lost, over: (job) => !ACTIVE.includes(job.state) });
+	return follow(`v1/jobs/${id}/events`, signal, update, { lost, over: (job) => !ACTIVE.includes(job.state) }).finally(() => clearInterval(tick));
 }
 
 function describe(job) {

@@ -38,16 +38,20 @@ export async function list(main, signal, { kind, states = [], named = false, bus
 		entries = found;
 		draw();
 	}
-	const load = newest(async () => {
+	let failed; // the error of the last request, and whether that was for older entries
+	const load = newest(async (isMore) => {
 		try {
-			await read([]);
+			await read(isMore ? entries : []);
+			failed = undefined;
 			problem.replaceChildren();
 		} catch (error) {
 			signal.throwIfAborted();
-			problem.replaceChildren(problemBox(error), button(t("again"), refused, load));
+			// Otherwise a screen reader would read it again each time.
+			if (failed?.error.message !== error.message) problem.replaceChildren(problemBox(error), button(t("again"), refused, () => load(failed?.isMore)));
+			failed = { error, isMore };
 		}
 	});
-	const more = button(t("older"), problem, () => read(entries), "more");
+	const more = button(t("older"), refused, () => load(true), "more");
 
 	const remove = h("button.danger", {
 		type: "button",
@@ -118,11 +122,13 @@ export async function list(main, signal, { kind, states = [], named = false, bus
 	await load();
 	watch().catch(() => {}); // the user left the view
 
-	// Refreshes the first page only, and only while no further page is shown.
+	// Tries again what failed. Refreshes the first page only, and only while no further page is shown.
 	async function watch() {
 		for (;;) {
 			await pause(REFRESH, signal);
-			if (!document.hidden && entries.length <= PAGE && entries.some(busy)) await load();
+			if (document.hidden || more.disabled) continue;
+			if (failed?.error.isTemporary) await load(failed.isMore);
+			else if (entries.length <= PAGE && entries.some(busy)) await load();
 		}
 	}
 }

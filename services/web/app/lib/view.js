@@ -1,6 +1,6 @@
 // What several views have in common: steps, deletion, names, qualities, thumbnails.
 import { remove } from "./api.js";
-import { button, confirmed, h, newest, show } from "./dom.js";
+import { button, confirmed, h, newest, pause, show } from "./dom.js";
 import { t } from "./words.js";
 
 const STEPS = ["film", "check", "recover", "play"];
@@ -37,11 +37,16 @@ export function thumbnails(signal, request) {
 	const draw = newest(async () => {
 		while (queue.length && !signal.aborted) {
 			const frame = queue.shift();
+const RETRY = 5000; // ms
 			const { id } = frame.dataset;
 			try {
 				if (!thumbs.has(id)) thumbs.set(id, await request(id));
 				await show(frame.firstChild, thumbs.get(id));
-			} catch {} // the place stays empty
+			} catch (error) { // the place stays empty
+				if (!error.isTemporary) continue;
+				queue.push(frame);
+				await pause(RETRY, signal).catch(() => {}); // the user left the view
+			}
 		}
 	});
 	const seen = new IntersectionObserver((entries) => {

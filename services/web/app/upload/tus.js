@@ -7,8 +7,7 @@ import { t } from "../lib/words.js";
 const PART = 8 << 20; // bytes of a request; the service takes 10,000 of them
 const LONGEST = 30_000; // ms between two attempts
 const TUS = { "Tus-Resumable": "1.0.0" };
-// The service has more bytes than assumed, is busy, or is unreachable: ask for the offset and try again.
-const TEMPORARY = [0, 409, 429, 502, 503, 504];
+const OTHER_OFFSET = 409; // the service has more bytes than assumed
 
 // A PATCH request that reports its progress, which `fetch` cannot.
 function patch(path, offset, part, progress, signal) {
@@ -82,7 +81,7 @@ export async function send(file, remembered, { filename, signal, progress, waiti
 				continue;
 			}
 			if (error.status === 401 && isPart) continue; // `ask` asks for a key when it requests the offset
-			if (!TEMPORARY.includes(error.status)) throw error;
+			if (!error.isTemporary && error.status !== OTHER_OFFSET) throw error;
 			const end = performance.now() + wait;
 			for (let left = wait; left > 0; left = end - performance.now()) {
 				waiting(true, left);
