@@ -329,3 +329,34 @@ def test_service_restarts_with_another_key_during_upload(
             page.get_by_role("link", name="Film", exact=True).click()
             address = re.compile(rf"^http://[\d.]+:{port}/#/film$|This machine is not on a network")
             expect(page.get_by_text(address)).to_be_visible()
+
+
+@pytest.mark.parametrize("action", ["delete", "film", "recover", "rename"])
+def test_answer_that_comes_late_leaves_the_next_view_alone(
+    desk: Page, service: Service, ready: tuple[str, str], action: str
+) -> None:
+    held: list[Route] = []
+    desk.route(
+        re.compile(r"/v1/\w+(/\w+)?$"),
+        lambda route: route.continue_() if route.request.method == "GET" else held.append(route),
+    )
+    desk.goto(f"{service.url}/#/{'film' if action == 'film' else f'captures/{ready[0]}'}")
+    if action == "delete":
+        desk.get_by_role("button", name="Delete", exact=True).click()
+        desk.get_by_role("button", name="Delete capture").click()
+    elif action == "film":
+        desk.get_by_role("button", name="Continue").dblclick()
+    elif action == "recover":
+        desk.get_by_role("button", name="Recover", exact=True).click()
+    else:
+        desk.get_by_role("button", name="Rename").click()
+        desk.keyboard.press("Enter")
+    while not held:
+        desk.wait_for_timeout(50)
+    desk.get_by_role("navigation").get_by_role("link", name="Mattes").click()
+    expect(desk).to_have_title("Mattes · envmatte")
+    assert len(held) == 1  # also of a double click
+    held[0].fulfill(json={"id": "made", "name": "a ball"})
+    desk.wait_for_timeout(300)
+    assert desk.url.endswith("#/mattes")
+    assert desk.title() == "Mattes · envmatte"

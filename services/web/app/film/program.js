@@ -6,7 +6,7 @@ import { badge, duration, empty, facts, fileField, h, pause, problemBox, prose, 
 import { follow } from "../lib/events.js";
 import { STILLS, isFilm, isStill, programName, recordOf, stillsRecordOf, together } from "../upload/bundle.js";
 import { list } from "../lib/list.js";
-import { FILM, steps } from "../lib/view.js";
+import { FILM, staying, steps } from "../lib/view.js";
 import { countScreen, isPhone, onZoom } from "./screen.js";
 import { begin, onDrop, running } from "../upload/upload.js";
 import { parts, said, t } from "../lib/words.js";
@@ -29,20 +29,25 @@ export async function filming(main, signal) {
 		const about = h("span.hint", { id: `preset-${name}` }, said(description));
 		return h("p.preset", h("label.choice", h("input", { type: "radio", name: "preset", value: name, checked: n === 0, "aria-describedby": about.id }), name), about);
 	});
+	const submit = h("button.primary", t("continue"));
 	const form = h("form.panel", h("h2", t("film.choose")),
 		h("fieldset.stack", h("legend", t("film.shows")), choices),
 		h("div.row", h("label", t("film.width"), width), h("label", t("film.height"), height), h("span.unit", t("film.pixels"))),
 		h("p.hint", t(isPhone() ? "film.other" : "film.screen")),
-		problem, h("p.row", h("button.primary", t("continue"))));
+		problem, h("p.row", submit));
 	form.onsubmit = async (event) => {
 		event.preventDefault();
 		problem.replaceChildren();
+		submit.disabled = true;
+		const isHere = staying();
 		try {
 			const monitor = { width: width.valueAsNumber, height: height.valueAsNumber };
 			const made = await post("v1/programs", { preset: form.elements.preset.value, monitor, border: true });
-			location.hash = `#/film/${made.id}`;
+			if (isHere()) location.hash = `#/film/${made.id}`;
 		} catch (error) {
 			problem.replaceChildren(problemBox(error));
+		} finally {
+			submit.disabled = false;
 		}
 	};
 	main.append(steps(FILM), h("h1", t("filming")),

@@ -25,7 +25,7 @@ export function renamable(text, label, save) {
 		event.preventDefault();
 		try {
 			title.textContent = await save(input.value.trim());
-			document.title = `${title.textContent} · envmatte`;
+			if (title.isConnected) document.title = `${title.textContent} · envmatte`;
 			edit(false);
 		} catch (error) {
 			problem.replaceChildren(problemBox(error));

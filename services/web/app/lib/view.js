@@ -11,13 +11,21 @@ export const steps = (at, ...links) =>
 	h("ol.steps", { "aria-label": t("steps") }, STEPS.map((name, n) =>
 		h("li", { "aria-current": n === at && "step" }, n < at && links[n] ? h("a", { href: links[n] }, t(`step.${name}`)) : t(`step.${name}`))));
 
+// Says later whether the user is still in the view that is shown now: who has left it is not led elsewhere.
+export function staying() {
+	const view = () => location.hash.split("?")[0];
+	const now = view();
+	return () => view() === now;
+}
+
 // A button that deletes what a path such as `v1/captures/ID` names; then its list is shown.
 export function deletion(path, where, lost) {
 	const [, list] = path.split("/");
 	return button(t("delete"), where, async () => {
 		if (!(await confirmed(t(`delete.${list}?`), lost, t(`delete.${list}`)))) return;
+		const isHere = staying();
 		await remove(path);
-		location.replace(`#/${list}`);
+		if (isHere()) location.replace(`#/${list}`);
 	}, "quiet");
 }
 
@@ -29,6 +37,7 @@ export const matteName = ({ id, name }) => name || t("matte.unnamed", { id: id.s
 // The name of a file of a matte.
 export const fileName = (matte, kind) => `${matteName(matte).replace(/[^\p{L}\p{N}._-]+/gu, "_")}.${kind}`;
 
+const RETRY = 5000; // ms
 const thumbs = new Map(); // by id: what is ready never changes
 
 // A function that makes thumbnails. Pictures are requested one after the other, and only of what is in view.
@@ -37,7 +46,6 @@ export function thumbnails(signal, request) {
 	const draw = newest(async () => {
 		while (queue.length && !signal.aborted) {
 			const frame = queue.shift();
-const RETRY = 5000; // ms
 			const { id } = frame.dataset;
 			try {
 				if (!thumbs.has(id)) thumbs.set(id, await request(id));

@@ -1,7 +1,7 @@
 // The form that starts a recovery. Its options and their descriptions come from GET /v1/options.
 import { getJson, post } from "../lib/api.js";
 import { duration, h, problemBox, prose } from "../lib/dom.js";
-import { QUALITIES } from "../lib/view.js";
+import { QUALITIES, staying } from "../lib/view.js";
 import { said, t } from "../lib/words.js";
 
 const BY_HAND = "envmatte-recover-by-hand"; // in this browser's storage
@@ -74,6 +74,7 @@ export async function recoveryForm(capture, signal) {
 	async function start(once) {
 		const submit = form.querySelector("button.primary");
 		submit.disabled = true;
+		const isHere = staying();
 		problem.replaceChildren();
 		fields.forEach(({ input }) => input.removeAttribute("aria-invalid"));
 		try {
@@ -81,7 +82,7 @@ export async function recoveryForm(capture, signal) {
 			const wanted = { ...chosen(fields, method.value), ...(quality === "fast" && { quality }), ...(cutOut.checked && { cut_out: true }) };
 			const job = await post("v1/jobs", { capture: capture.id, options: wanted }, once);
 			if (once) automatic.add(job.id);
-			location.hash = `#/jobs/${job.id}`;
+			if (isHere()) location.hash = `#/jobs/${job.id}`;
 		} catch (error) {
 			problem.replaceChildren(problemBox(error));
 			const wrong = fields.find(({ option, input }) => option.name === error.field && !input.disabled)?.input;
