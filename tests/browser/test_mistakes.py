@@ -360,3 +360,29 @@ def test_answer_that_comes_late_leaves_the_next_view_alone(
     desk.wait_for_timeout(300)
     assert desk.url.endswith("#/mattes")
     assert desk.title() == "Mattes · envmatte"
+
+
+def test_upload_cancelled_while_the_file_is_read_sends_nothing_more(
+    desk: Page, service: Service, tmp_path: Path
+) -> None:
+    film = tmp_path / "card.zip"
+    film.write_bytes(b"PK\x03\x04" + bytes(200_000))
+    sent: list[str] = []
+    desk.on("request", lambda request: sent.append(request.method))
+    desk.goto(f"{service.url}/#/captures")
+    # As from a slow disk.
+    desk.evaluate(
+        """() => {
+            const { arrayBuffer } = Blob.prototype;
+            Blob.prototype.arrayBuffer = async function () {
+                if (this.size > 1e5) await new Promise((resolve) => Object.assign(window, { resolve }));
+                return arrayBuffer.call(this);
+            };
+        }"""
+    )
+    desk.get_by_label(ZIP).set_input_files(film)
+    desk.wait_for_function("() => window.resolve")
+    desk.get_by_role("region", name="card.zip").get_by_role("button", name="Cancel").click()
+    desk.evaluate("window.resolve()")
+    desk.wait_for_timeout(1000)
+    assert "PATCH" not in sent

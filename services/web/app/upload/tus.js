@@ -64,6 +64,7 @@ export async function send(file, remembered, { filename, signal, progress, waiti
 			waiting(false);
 			while (offset < file.size) {
 				const part = await file.slice(offset, offset + PART).arrayBuffer(); // throws if the file is gone, which is not a lost connection
+				signal.throwIfAborted();
 				offset = await patch(`v1/uploads/${id}`, offset, part, progress, signal);
 				progress(offset);
 				wait = 1000;

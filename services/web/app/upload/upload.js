@@ -88,6 +88,7 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 			status.textContent = t("upload.checking");
 			const made = await post("v1/captures", { upload }, `capture-of-${upload}`);
 			localStorage.removeItem(remembered);
+			stop.signal.throwIfAborted();
 			if (isFilm(file)) await noteCapture(film, made.id);
 			arrived(`#/captures/${made.id}`);
 		} catch (error) {
