@@ -10,9 +10,8 @@ from tests.end_to_end.conftest import Service, paused
 from tests.end_to_end.mattes.test_previews import HEIGHT, WIDTH, upload_large
 from tests.parts.waiting import until
 
-pytestmark = pytest.mark.exhaustive
 
-
+@pytest.mark.exhaustive
 def test_glass_is_in_the_hand_before_it_is_recovered(desk: Page, service: Service, tmp_path: Path) -> None:
     capture = upload_large(service, tmp_path / "ball.zip")
     job = service.client.recover(capture, quality="fast")
@@ -59,3 +58,14 @@ def test_glass_is_in_the_hand_before_it_is_recovered(desk: Page, service: Servic
     expect(desk.get_by_role("heading", name="Layers")).to_be_visible()
     expect(desk.get_by_text("This browser draws the glass while you move; when")).to_be_visible()
     assert "right=" in desk.url  # the placement stays
+
+
+@pytest.mark.slow
+def test_matte_is_shown_as_soon_as_there_is_something_to_see(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    with paused(service):
+        matte = service.client.recover(ready[0], quality="fast")["matte"]
+        desk.goto(f"{service.url}/#/mattes/{matte}")
+        expect(desk.get_by_text("Not ready")).to_be_visible()
+    expect(desk.get_by_text("exact")).to_be_visible()

@@ -1,7 +1,7 @@
 // Mattes: the list, and one matte with its composite and layers.
 import { getComposite, getJson, patchJson, save } from "../lib/api.js";
 import { backdrop } from "../composite/backdrops/backdrops.js";
-import { badge, button, empty, facts, h, size, when } from "../lib/dom.js";
+import { badge, button, empty, facts, h, pause, size, when } from "../lib/dom.js";
 import { compositing } from "../composite/compositing.js";
 import { layers } from "../composite/layers.js";
 import { recovering } from "../composite/recovering.js";
@@ -13,6 +13,7 @@ import { sharing } from "./sharing.js";
 import { renamable } from "../lib/rename.js";
 
 const THUMB = 240; // pixels
+const LOOK = 3000; // ms between two looks for a picture
 const checker = backdrop("Checker", THUMB, 180);
 
 export function matteCards(signal) {
@@ -70,9 +71,20 @@ export async function matte(main, signal, id) {
 		}));
 	} else {
 		const text = t(found.state === "failed" ? "matte.failed" : "matte.running");
+		if (found.state === "recovering") awaitPicture(found, signal).catch(() => {}); // the user left the view
 		main.append(h("div.empty", h("strong", t("matte.unready")), h("p", text), job && h("p", h("a", { href: `#/jobs/${job}` }, t("job.show")))));
 	}
 	main.append(details, h("p.row", page, archive, removal), problem);
+}
+
+// Shows the view again once there is something to see, or there will be nothing.
+async function awaitPicture({ id, state }, signal) {
+	for (let now = { state }; now.state === state && !now.preview; ) {
+		await pause(LOOK, signal);
+		now = await getJson(`v1/mattes/${id}`, signal).catch((error) => (error.isTemporary ? { state } : {}));
+	}
+	signal.throwIfAborted();
+	dispatchEvent(new HashChangeEvent("hashchange"));
 }
 
 // The newest matte of the same capture in each other quality, by its name.
