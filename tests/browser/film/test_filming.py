@@ -286,3 +286,37 @@ def test_outage_is_said_while_a_program_is_followed(desk: Page, service: Service
     assert away.is_visible()
     desk.unroute("**/v1/programs/*/events")
     expect(desk.get_by_text("Open the player on the monitor")).to_be_visible()
+
+
+def test_camera_that_is_slow_to_open_and_to_lock(desk: Page, service: Service) -> None:
+    desk.add_init_script(
+        """
+        const held = window.held = [];
+        const wait = () => new Promise((resolve) => held.push(resolve));
+        const { getUserMedia } = navigator.mediaDevices;
+        navigator.mediaDevices.getUserMedia = async (wanted) => {
+            await wait();
+            return getUserMedia.call(navigator.mediaDevices, wanted);
+        };
+        MediaStreamTrack.prototype.getCapabilities = () => ({ focusMode: ["manual"] });
+        MediaStreamTrack.prototype.applyConstraints = wait;
+        """
+    )
+    desk.route("**/v1/uploads", lambda route: None)  # the film stays here
+    made = service.http.post("/v1/programs", json={"program": SHORT, "monitor": SCREEN}).json()
+    desk.goto(f"{service.url}/#/film/{made['id']}")
+    desk.get_by_role("button", name="Use a camera of this device").click()
+    desk.evaluate("held.pop()()")
+    which = desk.get_by_label("Camera", exact=True)
+    expect(which).to_be_enabled()
+    which.dispatch_event("change")
+    expect(which).to_be_disabled()  # two at once would leave one of them on
+    desk.evaluate("held.pop()()")
+    expect(which).to_be_enabled()
+    desk.get_by_role("button", name="Start recording").click()
+    desk.get_by_role("button", name="Stop recording").click()
+    done = desk.get_by_text("Recorded.")
+    expect(done).to_be_visible()
+    desk.evaluate("held.pop()()")
+    desk.wait_for_timeout(200)
+    assert done.is_visible()

@@ -32,7 +32,7 @@ export function camera(signal, filmed, ready) {
 
 	async function use(deviceId) {
 		problem.replaceChildren();
-		open.disabled = true;
+		open.disabled = which.disabled = true;
 		try {
 			close();
 			const wanted = { width: { ideal: 1920 }, height: { ideal: 1080 }, frameRate: { ideal: 30 } };
@@ -52,6 +52,7 @@ export function camera(signal, filmed, ready) {
 			if (!signal.aborted) problem.replaceChildren(problemBox(error));
 		} finally {
 			open.disabled = false;
+			which.disabled = Boolean(recorder);
 		}
 	}
 	which.onchange = () => use(which.value);
@@ -89,7 +90,7 @@ export function camera(signal, filmed, ready) {
 		shoot.textContent = t("record.stop");
 		which.disabled = true;
 		const free = await lock(stream.getVideoTracks()[0]);
-		status.textContent = free.length ? t("record.free", { what: free.join(", ") }) : t("record.on");
+		if (recorder === mine) status.textContent = free.length ? t("record.free", { what: free.join(", ") }) : t("record.on");
 	}
 
 	async function stop(ended = true) {
