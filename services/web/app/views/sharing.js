@@ -20,13 +20,13 @@ export function sharing(id, signal) {
 			if (made.dataset.link === link) made.replaceChildren();
 			item.remove();
 		}, "quiet");
-		const item = h("li", h("span", parts("share.until", { from: when(created), to: when(expires) })), end);
+		const item = h("li", { "data-id": link }, h("span", parts("share.until", { from: when(created), to: when(expires) })), end);
 		return item;
 	};
 	const create = button(t("share.make"), problem, async () => {
+		const { url, problem: here } = await elsewhere(signal); // before: what is made is shown only once
 		const link = await post(path, { days: Number(days.value) });
 		made.dataset.link = link.id;
-		const { url, problem: here } = await elsewhere(signal);
 		const to = (where) => new URL(where.slice(1), url ? `${url}/` : location.href.split("#")[0]).href;
 		made.replaceChildren(...[field(t("share.link"), to(link.path), problem),
 			field(t("share.embed"), h("iframe", { src: to(link.embed), width: 640, height: 560 }).outerHTML, problem),
@@ -35,10 +35,19 @@ export function sharing(id, signal) {
 	}, "primary");
 	const panel = h("details.panel", h("summary", h("h2", t("share"))),
 		h("div.stack", h("p", t("share.about")), h("div.row", h("label", { for: "days" }, t("share.expires")), days, create), problem, made, links));
-	panel.addEventListener("toggle", () => getJson(path, signal).then(
-		(found) => links.append(...found.links.map(row)),
-		(error) => signal.aborted || problem.replaceChildren(problemBox(error)),
-	), { once: true });
+	let isRead = false;
+	panel.addEventListener("toggle", async () => {
+		if (!panel.open || isRead) return;
+		isRead = true;
+		try {
+			const found = (await getJson(path, signal)).links;
+			links.append(...found.filter((one) => !links.querySelector(`[data-id="${one.id}"]`)).map(row)); // one may be made meanwhile
+			problem.replaceChildren();
+		} catch (error) {
+			isRead = false;
+			if (!signal.aborted) problem.replaceChildren(problemBox(error));
+		}
+	});
 	return panel;
 }
 
