@@ -238,3 +238,41 @@ def test_picture_comes_back_by_itself_after_an_outage(
     expect(desk.get_by_text("exact")).to_be_visible()
     expect(desk.get_by_text("This browser draws the glass while you move")).to_be_visible()
     expect(desk.get_by_role("alert")).to_have_count(0)
+
+
+def test_matte_that_cannot_be_compared_with_is_not_shown(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    other = {"id": "other", "state": "ready", "options": {"quality": "fine"}}
+    desk.route("**/v1/mattes?capture=*", lambda route: route.fulfill(json={"mattes": [other]}))
+    desk.route("**/v1/mattes/other/composite?*", lambda route: route.fulfill(status=500))
+    opened(desk, service, ready[1])
+    desk.get_by_role("radio", name="Backdrop").check()
+    aside = desk.locator("canvas.aside")
+    expect(aside).to_be_visible()
+    desk.get_by_role("radio", name="Best").check()
+    expect(desk.get_by_role("alert")).to_contain_text("The service answered with 500")
+    expect(aside).to_be_hidden()
+
+
+def test_backdrop_beside_an_explained_pixel_moves_along(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    opened(desk, service, ready[1])
+    desk.get_by_role("button", name="Explain a pixel").click()
+    expect(desk.locator("canvas.inset")).to_be_visible()
+    before = pixels(desk, "canvas.inset")
+    desk.get_by_role("slider", name="Turn").fill("30")
+    assert np.abs(pixels(desk, "canvas.inset") - before).mean() > 5
+
+
+def test_layer_that_does_not_come_is_not_mistaken_for_the_one_before(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    opened(desk, service, ready[1])
+    picture = desk.locator(".layer img")
+    expect(picture).to_be_visible()
+    desk.route("**/layers/alpha.png", lambda route: route.fulfill(status=500))
+    desk.get_by_role("radio", name="Mask").check()
+    expect(desk.get_by_role("alert")).to_contain_text("The service answered with 500")
+    expect(picture).to_be_hidden()

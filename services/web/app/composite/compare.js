@@ -19,24 +19,29 @@ export function comparison(stage, matte, others) {
 		[t("compare.live")]: () => stage.isLive && context.drawImage(stage.drawn(), 0, 0, width, height),
 		[t("backdrop")]: () => {
 			if (stage.isLive) return context.drawImage(stage.drawn(true), 0, 0, width, height);
-			return stage.backdrop.picture && drawPlaced(context, stage.backdrop.picture, stage.place, matte.monitor);
+			return stage.backdrop.picture ? drawPlaced(context, stage.backdrop.picture, stage.place, matte.monitor) : false;
 		},
 	};
 	for (const [name, other] of Object.entries(others)) {
 		kinds[name] = async () => context.drawImage(await createImageBitmap(await stage.composite("image/jpeg", {}, stage.backdrop, other.id)), 0, 0, width, height);
 	}
 	let chosen = null;
+	let moves = 0;
 	const hide = (is) => (aside.hidden = divider.hidden = is);
 	const draw = newest(async () => {
 		row.hidden = !chosen;
 		hide(true);
 		if (!chosen || !stage.isExact) return;
-		const made = await Promise.resolve(chosen()).catch(stage.fail);
-		hide(made === false || !stage.isExact);
+		const before = moves;
+		const made = await Promise.resolve(chosen()).catch((error) => (stage.fail(error), false));
+		hide(made === false || before !== moves); // what is moved meanwhile is drawn again
 	});
 	stage.element.append(aside, divider);
 	stage.element.addEventListener("exact", draw);
-	stage.element.addEventListener("moved", () => hide(true));
+	stage.element.addEventListener("moved", () => {
+		moves++;
+		hide(true);
+	});
 	const choice = (name) => h("label.choice",
 		h("input", { type: "radio", name: "compare", checked: !kinds[name], onchange: () => ((chosen = kinds[name]), draw()) }), name);
 	return h("div.stack", h("fieldset.row", h("legend", t("compare.with")), Object.keys(kinds).map(choice)), row);

@@ -23,6 +23,7 @@ export function explanation(stage, matte, signal) {
 	const figures = h("div");
 	const problem = h("div");
 	let pixel; // undefined while it is off
+	let explained; // what is drawn
 
 	const look = newest(async () => {
 		try {
@@ -33,7 +34,7 @@ export function explanation(stage, matte, signal) {
 			if (!pixel) return;
 			words.textContent = t("pixel", { x, y, words: inWords(found) });
 			figures.replaceChildren(found.recovered ? figuresOf(found) : "");
-			draw(found);
+			draw((explained = found));
 			problem.replaceChildren();
 		} catch (error) {
 			if (!signal.aborted) problem.replaceChildren(problemBox(error));
@@ -68,6 +69,7 @@ export function explanation(stage, matte, signal) {
 		const box = stage.element.getBoundingClientRect();
 		choose(Math.floor(((event.clientX - box.left) / box.width) * width), Math.floor(((event.clientY - box.top) / box.height) * height));
 	});
+	stage.element.addEventListener("moved", () => pixel && explained && draw(explained));
 	// Before the keys that move the backdrop.
 	stage.element.addEventListener("keydown", (event) => {
 		if (pixel && event.key === "Escape") return explain();
@@ -80,6 +82,7 @@ export function explanation(stage, matte, signal) {
 	});
 	function explain(first) {
 		pixel = first;
+		explained = undefined;
 		button.ariaPressed = String(Boolean(pixel));
 		panel.hidden = words.hidden = !pixel;
 		inset.hidden = true;

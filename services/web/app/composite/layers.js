@@ -24,11 +24,12 @@ export function layers(matte, signal) {
 			image.classList.toggle("linear", ["S", "rho"].includes(name)); // linear light, to be encoded for the display
 			problem.replaceChildren();
 		} catch (error) {
+			image.hidden = true; // it shows another layer
 			if (!signal.aborted) problem.replaceChildren(problemBox(error));
 		}
 	});
 	const names = h("fieldset.row", h("legend", t("layer")), LAYERS.map((name) =>
-		h("label.choice", h("input", { type: "radio", name: "layer", checked: name === FIRST, onchange: () => choose(name) }), t(`layer.label.${name}`))));
+		h("label.choice", h("input", { type: "radio", name: "layer", value: name, checked: name === FIRST, onchange: () => choose(name) }), t(`layer.label.${name}`))));
 	const plate = h("input", { type: "checkbox", checked: true });
 	const file = (name) => button(name, problem, () => {
 		const query = matte.cut_out && plate.checked && OF_PLATE.includes(name) ? "?plate=true" : "";
@@ -39,6 +40,6 @@ export function layers(matte, signal) {
 	const panel = h("details.panel", h("summary", h("h2", t("layers"))),
 		h("div.stack", names, frame, about, h("p.row", t("layers.tools"), files), h("p.row", t("layers.nodes"), nodes),
 			matte.cut_out && h("label.choice", plate, t("layers.plate")), problem));
-	panel.addEventListener("toggle", () => image.hidden && choose(FIRST), { once: true });
+	panel.addEventListener("toggle", () => panel.open && image.hidden && choose(names.querySelector(":checked").value));
 	return panel;
 }
