@@ -219,7 +219,7 @@ def test_matte_is_downloaded_and_deleted_items_are_gone(
     tab.goto(f"{service.url}/#/mattes/{ready[1]}")
     with tab.expect_download() as download:
         tab.get_by_role("button", name="Download the matte").click()
-    assert download.value.suggested_filename == f"matte-{ready[1]}.zip"
+    assert download.value.suggested_filename == "a_ball.zip"
     imported = service.client.import_matte(download.value.path())
     uploaded = service.client.upload(ball)
     service.client.wait(uploaded["job"])

@@ -19,7 +19,7 @@ from services.api.http.responses import bytes_response
 from services.api.http.router import Router
 from services.api.limits.quotas import admit
 from services.api.limits.reservations import reserved
-from services.api.mattes.mattes import Matte
+from services.api.mattes.mattes import Matte, save_as, title_of
 from services.runtime.problems import Unauthorized
 from storage.database.rows import new_id
 from storage.errors import Corrupt, NoRoom, NotFound
@@ -66,11 +66,8 @@ class _Download(Response):
         context = self._context
         async with context.archives.take(context.caller.owner, context.settings.request_seconds):
             # To open it is to make a list of its entries, which ends if nobody waits for the archive any more.
-            archive = await context.compute(Request(scope, receive), context.lists, self._open)
-            headers = {
-                "Content-Length": str(archive.size),
-                "Content-Disposition": f'attachment; filename="matte-{self._id}.zip"',
-            }
+            archive, title = await context.compute(Request(scope, receive), context.lists, self._open)
+            headers = {"Content-Length": str(archive.size)} | save_as(self._id, title, ".zip")
             response = StreamingResponse(self._pieces(archive), media_type=ZIP, headers=headers)
             try:
                 await response(scope, receive, send)
@@ -79,9 +76,9 @@ class _Download(Response):
                 level = logging.ERROR if isinstance(error, Corrupt) else logging.INFO
                 logger.log(level, "ended the download of matte %s: %s", self._id, error.detail)
 
-    def _open(self) -> Archive:
-        with self._context.stored(mattes.get_ready, self._id):
-            return Archive(self._context.objects, self._id)
+    def _open(self) -> tuple[Archive, str]:
+        with self._context.stored(mattes.get_ready, self._id) as row:
+            return Archive(self._context.objects, self._id), title_of(self._context, row)
 
     def _pieces(self, archive: Archive) -> Iterator[bytes]:
         with self._context.stored(mattes.get_ready, self._id):

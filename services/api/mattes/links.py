@@ -135,4 +135,4 @@ async def _shown(context: PublicContext, token: str, request: Request, headers: 
         return HTMLResponse(GONE, HTTPStatus.NOT_FOUND, headers | FRESH)
     # What it costs counts as its owner's.
     bound = replace(context, engine=for_owner(context.engine, row.owner), caller=Caller(row.owner, "read"))
-    return await live_page(bound, row.matte, request, headers | FRESH)
+    return await live_page(bound, row.matte, request, lambda _: headers | FRESH)

@@ -1,5 +1,6 @@
 """Mattes for graphics hardware over HTTP: for the web app, and as a page that draws the glass without a service."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -11,12 +12,12 @@ from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response, etag_matches
 from services.api.http.router import Router
 from services.api.mattes.live_page import make_page
+from services.api.mattes.mattes import save_as, title_of
 from services.api.mattes.progress import Progress, open_whole_frame, while_there
-from storage.database.engine import reading
-from storage.errors import NoRoom, NotFound
+from storage.errors import NoRoom
 from storage.layout import live as stored_live
 from storage.layout.mattes import Matte
-from storage.records import captures, mattes
+from storage.records import mattes
 from workflows.composite.live import encode
 from workflows.threads import CORES
 
@@ -70,17 +71,18 @@ async def get_live_page(context: OwnerContext, id: str, request: Request) -> Res
     """
 
     # Saved and not shown: here it would be a page of the service.
-    return await live_page(
-        context, id, request, {"Content-Disposition": f'attachment; filename="matte-{id}.html"'}
-    )
+    return await live_page(context, id, request, lambda title: save_as(id, title, ".html"))
 
 
-async def live_page(context: Context, id: str, request: Request, headers: dict[str, str]) -> Response:
-    """The answer with the page of a matte."""
+async def live_page(
+    context: Context, id: str, request: Request, headers: Callable[[str], dict[str, str]]
+) -> Response:
+    """The answer with the page of a matte; its headers may depend on the matte's title."""
 
     def load() -> Response:
-        page = make_page(_title(context, row), row.figures["monitor"], _encoded(context, id, matte))
-        return bytes_response(page, "text/html", headers)
+        title = title_of(context, row)
+        page = make_page(title, row.figures["monitor"], _encoded(context, id, matte))
+        return bytes_response(page, "text/html", headers(title))
 
     row, matte = await context.call(_open, context, id)
     return await context.compute(request, context.layers, load, memory=_bytes_of(matte))
@@ -100,16 +102,6 @@ def _open(context: Context, id: str) -> tuple[Row[Any], Matte]:
 def _bytes_of(matte: Matte) -> int:
     """Bytes that encoding a matte takes at most."""
     return encode.bytes_of_live(matte) + CORES * BLOCK_BYTES
-
-
-def _title(context: Context, row: Row[Any]) -> str:
-    """What people call a matte: its name, or that of its capture as long as that exists."""
-    if row.name:
-        return str(row.name)
-    with suppress(NotFound), reading(context.engine) as c:
-        if name := captures.get(c, row.capture or "").name:
-            return str(name)
-    return f"Matte {row.id[:8]}"
 
 
 def _encoded(context: Context, id: str, matte: Matte) -> bytes:

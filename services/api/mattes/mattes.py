@@ -1,13 +1,16 @@
 """Mattes over HTTP: list, read and delete them."""
 
+import re
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, Literal
+from urllib.parse import quote
 
 from fastapi import Request, Response
 from pydantic import BaseModel, Field
 from sqlalchemy import Connection, Row
 
-from services.api.context import OwnerContext
+from services.api.context import Context, OwnerContext
 from services.api.http.responses import json_response, utc_time
 from services.api.http.router import Router
 from services.api.http.types import After, Named, PageSize, Pair
@@ -15,9 +18,9 @@ from services.api.renaming import CHANGE, rename
 from storage.database.engine import reading, writing
 from storage.database.rows import page
 from storage.database.tables import mattes as table
-from storage.errors import Conflict
+from storage.errors import Conflict, NotFound
 from storage.layout import mattes as stored_mattes
-from storage.records import jobs, mattes
+from storage.records import captures, jobs, mattes
 
 router = Router(tags=["mattes"])
 
@@ -116,3 +119,19 @@ def delete_matte(context: OwnerContext, id: str) -> None:
         mattes.delete(c, id)
     context.cache.forget(id)
     context.objects.delete(stored_mattes.path(id))
+
+
+def title_of(context: Context, row: Row[Any]) -> str:
+    """What people call a matte: its name, or that of its capture as long as that exists."""
+    if row.name:
+        return str(row.name)
+    with suppress(NotFound), reading(context.engine) as c:
+        if name := captures.get(c, row.capture or "").name:
+            return str(name)
+    return f"Matte {row.id[:8]}"
+
+
+def save_as(id: str, title: str, ending: str) -> dict[str, str]:
+    """The header by which a browser saves a file under a matte's title, and a program that reads ASCII under its id."""
+    name = quote(re.sub(r"[^\w.-]+", "_", title) + ending)
+    return {"Content-Disposition": f"attachment; filename=\"matte-{id}{ending}\"; filename*=UTF-8''{name}"}

@@ -173,7 +173,7 @@ def test_page_is_saved_by_a_button(desk: Page, service: Service, ready: tuple[st
     desk.goto(f"{service.url}/#/mattes/{ready[1]}")
     with desk.expect_download() as download:
         desk.get_by_role("button", name="Save as a web page").click()
-    assert download.value.suggested_filename == f"matte-{ready[1]}.html"
+    assert download.value.suggested_filename == "a_ball.html"
     assert download.value.path().read_bytes() == saved.read_bytes()
     answer = service.http.get(f"/v1/mattes/{ready[1]}/live.html")
     assert answer.headers["content-disposition"].startswith("attachment")

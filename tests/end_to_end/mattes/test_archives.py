@@ -77,7 +77,11 @@ def test_archive_has_a_name_and_a_size(service: Service, matte: str, archive: Pa
     assert answer.content == archive.read_bytes()
     assert answer.headers["content-type"] == "application/zip"
     assert answer.headers["content-length"] == str(archive.stat().st_size)
-    assert answer.headers["content-disposition"] == f'attachment; filename="matte-{matte}.zip"'
+    for title, name in (("Glas „1“", "Glas_1_"), ("Größe", "Gr%C3%B6%C3%9Fe"), ("a ball", "a_ball")):
+        service.http.patch(f"/v1/mattes/{matte}", json={"name": title})
+        answer = service.http.get(f"/v1/mattes/{matte}/archive")
+        disposition = f"attachment; filename=\"matte-{matte}.zip\"; filename*=UTF-8''{name}.zip"
+        assert answer.headers["content-disposition"] == disposition
     check_problem(service.http.get("/v1/mattes/none/archive"), 404, "not-found")
 
 

@@ -6,7 +6,7 @@ import { compositing } from "../composite/compositing.js";
 import { layers } from "../composite/layers.js";
 import { recovering } from "../composite/recovering.js";
 import { list } from "../lib/list.js";
-import { PLAY, deletion, matteName, qualityOf, steps, thumbnails } from "../lib/view.js";
+import { PLAY, deletion, fileName, matteName, qualityOf, steps, thumbnails } from "../lib/view.js";
 import { parts, t } from "../lib/words.js";
 import { reportLink } from "./report.js";
 import { sharing } from "./sharing.js";
@@ -41,8 +41,8 @@ export async function matte(main, signal, id) {
 	const isReady = found.state === "ready";
 	const state = badge(found.state);
 	const removal = deletion(`v1/mattes/${id}`, problem, t("matte.lost"));
-	const archive = button(t("matte.download"), problem, () => save(`v1/mattes/${id}/archive`, `matte-${id}.zip`));
-	const page = button(t("matte.page"), problem, () => save(`v1/mattes/${id}/live.html`, `matte-${id}.html`));
+	const archive = button(t("matte.download"), problem, () => save(`v1/mattes/${id}/archive`, fileName(found, "zip")));
+	const page = button(t("matte.page"), problem, () => save(`v1/mattes/${id}/live.html`, fileName(found, "html")));
 	archive.hidden = page.hidden = !isReady;
 	main.append(
 		steps(PLAY, "#/captures", capture && `#/captures/${capture}`, job && `#/jobs/${job}`),
