@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import os
 import re
 import zipfile
 import zlib
@@ -118,6 +119,56 @@ def test_stills_become_a_capture(desk: Page, service: Service, ball: Path, tmp_p
     assert (found["state"], found["frames"]) == ("ready", len(stills))
     first = service.http.get(f"/v1/captures/{found['id']}/frames/1.png").content
     assert np.array_equal(Image.open(io.BytesIO(first)), Image.open(stills[1]))
+
+
+@pytest.mark.parametrize(
+    ("names", "taken", "note"),
+    [
+        (
+            ["DSC_0001.JPG", "DSC_0002.JPG", "DSC_9999.JPG"],
+            "9999 0001 0002",
+            "DSC_0001.JPG is taken as the one after",
+        ),
+        (["IMG_9.CR3", "IMG_9.JPG", "IMG_10.CR3", "IMG_10.JPG"], "9 10", "those in .CR3 are taken"),
+    ],
+)
+def test_what_is_done_to_stills_is_said_before(
+    desk: Page, service: Service, tmp_path: Path, names: list[str], taken: str, note: str
+) -> None:
+    desk.goto(f"{service.url}/#/captures")
+    for name in names:
+        (tmp_path / name).write_bytes(b"still")
+        os.utime(tmp_path / name, (1e9, 1e9))
+    desk.get_by_label(ZIP).set_input_files([tmp_path / name for name in names])
+    expect(desk.get_by_text(note)).to_be_visible()
+    desk.get_by_role("button", name="Continue", exact=True).click()
+    expect(desk.get_by_label("Or the capture.json that came with the program")).to_be_attached()
+    stills = desk.evaluate(
+        """async (names) => {
+            const { together } = await import("/web/app/upload/bundle.js");
+            const files = names.map((name) => new File([], name, { lastModified: 1 }));
+            return together(files).stills.map(({ name }) => name);
+        }""",
+        names,
+    )
+    assert " ".join(re.sub(r"\D*(\d+).*", r"\1", name) for name in stills) == taken
+
+
+def test_numbers_out_of_the_order_of_time_stay(desk: Page, service: Service) -> None:
+    """Stills that were chosen of two series, and names without a wide gap."""
+    desk.goto(f"{service.url}/#/captures")
+    expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
+    in_order = """async (stills) => {
+        const { together } = await import("/web/app/upload/bundle.js");
+        const files = stills.map(([name, lastModified]) => new File([], name, { lastModified }));
+        return together(files).stills.map(({ name }) => name);
+    }"""
+    for stills in (
+        [["A1.PNG", 5], ["A9999.PNG", 6]],
+        [["A1.PNG", 9], ["A90.PNG", 7]],
+        [["1.NEF", 5], ["2.JPG", 5]],
+    ):
+        assert desk.evaluate(in_order, stills) == [name for name, _ in stills]
 
 
 def test_film_and_record_are_zipped(desk: Page, service: Service) -> None:

@@ -5,6 +5,8 @@ import { countPatterns } from "./archive_info.js";
 import { zip } from "./zip.js";
 import { parts, t } from "../lib/words.js";
 
+const RAW = /\.(dng|nef|cr2|cr3|arw|raf|orf|rw2)$/i;
+const LAST = 9999; // number that a camera gives a still
 const ENDS = /\.(mp4|m4v|mov|mkv|webm|avi|3gp|mts|m2ts)$/i;
 // Browsers know no type of MKV, and give MTS that of something else.
 export const isFilm = (file) => file.type.startsWith("video/") || ENDS.test(file.name);
@@ -31,18 +33,44 @@ export async function filmArchive(film, record, signal) {
 	return zip([["capture.json", new Blob([text])], [file, film]], signal);
 }
 
-// Stills as one thing to upload: one of each pattern, in the order of their names.
+// Stills as one thing to upload: one of each pattern, in the order of their names. A `note` says what was done to them.
 export function together(files) {
-	const stills = [...files].sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
-	const [{ name: first }] = stills;
-	return { name: stills.length > 1 ? t("stills.name", { first, n: stills.length }) : first, type: "", stills, lastModified: stills[0].lastModified };
+	const all = [...files].sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
+	const raw = onlyRaw(all);
+	const { stills, note } = inOrder(raw ?? all);
+	const [{ name: first, lastModified }] = stills;
+	const kind = raw && endOf(first);
+	return {
+		name: stills.length > 1 ? t("stills.name", { first, n: stills.length }) : first, type: "", stills, lastModified,
+		note: [raw && t("stills.raw", { kind }), note].filter(Boolean).join(" "),
+	};
+}
+
+const endOf = (name) => /\.\w+$/.exec(name)?.[0] ?? "";
+const stemOf = ({ name }) => name.slice(0, name.length - endOf(name).length).toLowerCase();
+
+// The camera RAW of stills that a camera stored as JPEG or HEIC as well.
+function onlyRaw(stills) {
+	const raw = stills.filter(({ name }) => RAW.test(name));
+	const others = stills.filter((one) => !raw.includes(one)).map(stemOf);
+	return raw.length && `${raw.map(stemOf)}` === `${others}` ? raw : undefined;
+}
+
+// After 9999 cameras count from 0 or 1 again: what comes after the wide gap in the numbers was taken first, unless the
+// times of the files say otherwise.
+function inOrder(stills) {
+	const numbers = stills.map((one) => Number(/\d+(?=\D*$)/.exec(stemOf(one))));
+	const gap = numbers.findIndex((number, n) => number - numbers[n - 1] > LAST / 2);
+	const [first, last] = [stills[0], stills.at(-1)];
+	if (gap < 0 || numbers.at(-1) > LAST || last.lastModified > first.lastModified) return { stills };
+	return { stills: [...stills.slice(gap), ...stills.slice(0, gap)], note: t("stills.rolled", { first: first.name, last: last.name }) };
 }
 
 export async function stillsArchive({ stills }, { video, mask, ...record }, signal) {
 	const patterns = countPatterns(record.program);
 	if (stills.length !== patterns) throw new Problem({ status: 422, title: t("upload.none"), detail: t("stills.count", { n: stills.length, patterns }) });
 	const name = record.name || stills[0].name.replace(/\.\w+$/, "").slice(0, 200);
-	const frames = stills.map((still, pattern) => ({ file: `${String(pattern).padStart(5, "0")}${/\.\w+$/.exec(still.name)?.[0].toLowerCase() ?? ""}`, pattern }));
+	const frames = stills.map((still, pattern) => ({ file: `${String(pattern).padStart(5, "0")}${endOf(still.name).toLowerCase()}`, pattern }));
 	const text = JSON.stringify({ ...record, name, frames });
 	return zip([["capture.json", new Blob([text])], ...frames.map(({ file }, n) => [file, stills[n]])], signal);
 }

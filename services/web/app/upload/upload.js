@@ -18,7 +18,7 @@ addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) =
 
 // Uploads a capture archive, or a film or stills with their capture.json; without one, asks for their program. A film was
 // filmed in the view `again`. One that was recorded here has an `id`: it can be saved, is kept until its capture is ready,
-// and is discarded only after a question. One with a `warning` waits for the user; one that is `stored` is kept already.
+// and is discarded only after a question. One with a `warning`, and stills with a `note`, wait for the user; one that is `stored` is kept already.
 export function begin(file, record, { again: view = "#/film", id, at = Date.now(), warning = "", stored = false } = {}) {
 	const film = { id, at, file, record, again: view, warning };
 	const state = { busy: false, unsaved: Boolean(id) && !stored };
@@ -104,9 +104,9 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 			state.busy = false;
 		}
 	}
-	if (!warning && !stored) return work();
-	status.textContent = stored ? `${t("film.kept", { time: when(at).textContent })} ${warning}` : warning;
-	again.textContent = t(warning ? "upload.anyway" : "upload");
+	if (!warning && !stored && !file.note) return work();
+	status.textContent = stored ? `${t("film.kept", { time: when(at).textContent })} ${warning}` : warning || file.note;
+	again.textContent = t(file.note ? "continue" : warning ? "upload.anyway" : "upload");
 	again.hidden = false;
 }
 

@@ -424,6 +424,8 @@ export const de = {
 	"stills": "Fotos",
 	"stills.count": "Das Programm zeigt {patterns} Bilder, gewählt sind {n} Fotos. Gebraucht wird eines von jedem Bild, in der Reihenfolge ihrer Namen und alle von einer Art.",
 	"stills.name": "{first} und weitere, zusammen {n}",
+	"stills.raw": "Jedes Foto wurde in zwei Arten gewählt: Die in {kind} werden genommen, die anderen nicht.",
+	"stills.rolled": "Die Kamera hat neu zu zählen begonnen: {first} gilt als das Foto nach {last}.",
 	"take": "Kopieren und herunterladen",
 	"take.as": "Herunterladen als",
 	"take.copied": "Das Bild ist in der Zwischenablage.",

@@ -424,6 +424,8 @@ export const en = {
 	"stills": "Stills",
 	"stills.count": "The program shows {patterns} pictures, and you chose {n} stills. Choose one of each picture, in the order of their names and all of one kind.",
 	"stills.name": "{first} and others, {n} in all",
+	"stills.raw": "Each still was chosen in two kinds: those in {kind} are taken, and the others left out.",
+	"stills.rolled": "The camera’s numbers began again: {first} is taken as the one after {last}.",
 	"take": "Copy and download",
 	"take.as": "Download as",
 	"take.copied": "The picture is in the clipboard.",
