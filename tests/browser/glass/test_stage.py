@@ -94,6 +94,14 @@ def test_picture_is_divided_between_backdrop_and_glass(
     assert np.unique(bare[0, 30:, :3], axis=0).shape[0] >= 6
     desk.get_by_role("slider", name="Divide").fill("20")
     expect(aside).to_have_css("clip-path", "inset(0px 80% 0px 0px)")
+    box = desk.get_by_role("group", name="Composite.").bounding_box()
+    assert box
+    desk.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 0.3 * box["height"])
+    desk.mouse.down()
+    desk.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.4 * box["height"], steps=3)
+    desk.mouse.up()
+    expect(aside).to_have_css("clip-path", re.compile(r"^inset\(0px (29|30)\.?\d*% 0px 0px\)$"))
+    expect(desk.locator("output[for=place-right]")).to_have_text("25 %")  # the backdrop stays
     before = aside.evaluate(CANVAS)
     desk.get_by_role("radio", name="Live").check()
     desk.wait_for_function("(before) => document.querySelector('.aside').toDataURL() !== before", arg=before)

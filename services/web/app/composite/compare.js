@@ -8,12 +8,11 @@ export function comparison(stage, matte, others) {
 	const { width, height } = matte;
 	const aside = h("canvas.aside", { width, height, hidden: true, "aria-hidden": "true" });
 	const context = aside.getContext("2d");
-	const divider = h("span.divider", { hidden: true });
-	const slider = h("input", { type: "range", min: 0, max: 100, step: 1, value: 50, id: "divide" });
-	const row = h("div.row", { hidden: true }, h("label", { for: "divide" }, t("compare.divide")), slider);
-	const cut = () => stage.element.style.setProperty("--divide", `${slider.value}%`);
-	slider.oninput = cut;
+	const divider = h("input.divider", { type: "range", min: 0, max: 100, step: "any", value: 50, hidden: true, "aria-label": t("compare.divide") });
+	const cut = () => stage.element.style.setProperty("--divide", `${divider.value}%`);
+	divider.oninput = cut;
 	cut();
+	divider.onpointerdown = divider.onkeydown = (event) => event.stopPropagation(); // the backdrop stays where it is
 	const kinds = {
 		[t("compare.nothing")]: null,
 		[t("compare.live")]: () => stage.isLive && context.drawImage(stage.drawn(), 0, 0, width, height),
@@ -29,7 +28,6 @@ export function comparison(stage, matte, others) {
 	let moves = 0;
 	const hide = (is) => (aside.hidden = divider.hidden = is);
 	const draw = newest(async () => {
-		row.hidden = !chosen;
 		hide(true);
 		if (!chosen || !stage.isExact) return;
 		const before = moves;
@@ -44,5 +42,5 @@ export function comparison(stage, matte, others) {
 	});
 	const choice = (name) => h("label.choice",
 		h("input", { type: "radio", name: "compare", checked: !kinds[name], onchange: () => ((chosen = kinds[name]), draw()) }), name);
-	return h("div.stack", h("fieldset.row", h("legend", t("compare.with")), Object.keys(kinds).map(choice)), row);
+	return h("fieldset.row", h("legend", t("compare.with")), Object.keys(kinds).map(choice));
 }
