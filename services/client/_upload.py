@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 from services.client._errors import Busy, FileChanged, NotFound, ServiceError, Unreachable
 
@@ -63,7 +62,8 @@ def send(
             try:
                 if not where:
                     made = http.once("POST", "/v1/uploads", headers=create)
-                    where = urlsplit(http.header(made, "Location")).path
+                    # Its id alone: a proxy may put the prefix that it serves the service below before the path.
+                    where = f"/v1/uploads/{http.header(made, 'Location').rsplit('/', 1)[-1]}"
                 if offset < size:
                     offset = reached(http.once("HEAD", where, headers=TUS))
                 while offset < size:

@@ -72,3 +72,37 @@ def test_what_is_no_service_is_asked_once(tmp_path: Path, status: int) -> None:
     ):
         client.upload(tmp_path / "ball.zip")
     assert len(calls) == 1
+
+
+@pytest.mark.parametrize("location", ["/v1/uploads/u", "/glass/v1/uploads/u"])
+def test_upload_comes_through_a_proxy_that_serves_below_a_prefix(tmp_path: Path, location: str) -> None:
+    come = bytearray()
+
+    class Proxy(BaseHTTPRequestHandler):
+        def do(self) -> None:
+            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            below = self.path in ("/glass/v1/uploads", "/glass/v1/uploads/u", "/glass/v1/captures")
+            if below and self.command == "PATCH":
+                come.extend(body)
+            answer = b'{"id": "u"}' if self.path.endswith("captures") else b""
+            self.send_response(200 if below else 404)
+            for name, value in (
+                ("Location", location),
+                ("Upload-Offset", len(come)),
+                ("Content-Length", len(answer)),
+            ):
+                self.send_header(name, str(value))
+            self.end_headers()
+            self.wfile.write(answer)
+
+        do_POST = do_HEAD = do_PATCH = do
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    (tmp_path / "ball.zip").write_bytes(b"ball")
+    with web_server(Proxy) as url:
+        http = Session(f"{url}/glass/", None)
+        assert _upload.send(http, tmp_path / "ball.zip", {}, None) == {"id": "u"}
+        http.close()
+    assert come == b"ball"
