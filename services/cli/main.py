@@ -2,6 +2,7 @@
 
 import io
 import re
+import signal
 import sys
 from typing import Any
 
@@ -83,6 +84,10 @@ for command in (
 
 def run() -> None:
     """The entry point: every error becomes a message and an exit code."""
+    # What is half written is removed, as after Ctrl-C. `nohup` has SIGHUP ignored.
+    for number in processes.ENDING:
+        if signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
     try:
         main(standalone_mode=False, prog_name="envmatte")
     except ServiceError as error:

@@ -1,5 +1,6 @@
 """The commands of `envmatte` that run processes of a service, and the settings in their help."""
 
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ from services.cli.options import drop_unset
 from services.cli.output import example
 from storage.errors import InvalidInput
 
+ENDING = signal.SIGTERM, signal.SIGHUP
+"""What a supervisor sends, and a terminal that is closed. Other commands end at them as at Ctrl-C."""
 _certs = click.option(
     "--certs",
     type=click.Path(path_type=Path),
@@ -25,6 +28,9 @@ class _ProcessCommand(click.Command):
 
     def invoke(self, context: click.Context) -> Any:
         """Run the command; settings that its process can't work with are a wrong command line."""
+        for number in ENDING:  # once it has started, it ends in an order of its own
+            if signal.getsignal(number) == signal.default_int_handler:
+                signal.signal(number, signal.SIG_DFL)
         try:
             return super().invoke(context)
         except InvalidInput as error:

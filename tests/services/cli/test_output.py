@@ -1,12 +1,14 @@
 """Files that commands write with -o."""
 
 import os
+import signal
 import stat
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,7 @@ from click.testing import CliRunner
 from services.cli.main import main
 from services.client import Client, Unreachable
 from services.runtime.whole_files import open_whole
-from tests.services.client.servers import ok, scripted_server
+from tests.services.client.servers import ok, scripted_server, web_server
 
 ARCHIVE = 200, {}, b"an archive" * 1000
 CUT_OFF = 200, {"Content-Length": "20000"}, b"an archive" * 1000
@@ -93,6 +95,33 @@ def test_two_writers_of_a_file_do_not_meet(tmp_path: Path) -> None:
         other.write(b"other")
     assert path.read_bytes() == b"one"
     assert os.listdir(tmp_path) == ["matte.zip"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_export_that_is_ended_leaves_nothing(tmp_path: Path, number: int) -> None:
+    begun, ended = threading.Event(), threading.Event()
+
+    class Slow(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Length", "2000000")
+            self.end_headers()
+            self.wfile.write(bytes(1_000_000))
+            begun.set()
+            ended.wait(60)
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    with web_server(Slow) as url:
+        command = [sys.executable, "-m", "services", "export", "m", "-o", tmp_path / "m.zip", "--url", url]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as exporting:
+            assert begun.wait(60)
+            exporting.send_signal(number)
+            _, said = exporting.communicate(timeout=60)
+        ended.set()
+    assert (exporting.returncode, said.splitlines()[-1]) == (130, "Interrupted.")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_file_has_the_mode_of_the_umask_and_a_failure_leaves_the_old_one(tmp_path: Path) -> None:
