@@ -6,29 +6,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
-from workflows.images.tone_curves import Curve
-from workflows.ingest.camera.border_exposure import BorderLight, BorderValues
-from workflows.ingest.camera.calibration import is_free, measure
-from workflows.ingest.local_gain import local_gain
-from workflows.ingest.measured_light import black_patterns, look_up_of
+from workflows.ingest.camera.border_exposure import BorderValues
+from workflows.ingest.camera.calibration import is_free
+from workflows.ingest.measured_light import black_patterns
+from workflows.ingest.trial.explanation import explain
 from workflows.ingest.trial.movement import smooth_path
-from workflows.ingest.trial.tone_mapping import find_tone_mapping
 from workflows.ingest.trial.trial_recovery import (
     FURTHEST,
     Doubles,
     PixelSample,
     Trial,
     measure_rest,
-    take_sample,
     try_recovery,
 )
-from workflows.ingest.trial.unexplained import MEASURED, Unexplained, find_unexplained
+from workflows.ingest.trial.unexplained import find_unexplained
 from workflows.ingest.trial.white_exposure import find_white_excess
 from workflows.programs.program import Program
-from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.sensing import Patterns
 
 ROUNDS = 10
@@ -55,8 +50,6 @@ LEFT = 0.4
 predicted in ways that only look like shifts and gains."""
 NOTHING_LEFT = 0.1
 """An excess of the squared residual over noise that is as good as none."""
-TONE_MAPPING_TURNS = 2
-"""Turns in which local tone mapping is found, and corrected: T has explained some of it before it is."""
 MEMORY = 4
 """Rounds before the last one from which the next is extrapolated."""
 MIN_FRAMES = 8
@@ -137,11 +130,10 @@ def find_steadiness(
     program = Program.model_validate(stack.attributes["program"])
     if sample is None:
         return None
-    wide = _beyond_mask(stack, sample)
-    explained = _explain(stack, program, sample, wide, border)
+    explained = explain(stack, program, sample, border)
     if explained is None:
         return None
-    monitor, light, (at_first, through, _) = explained
+    monitor, light, wide, (at_first, through, _) = explained
     begin = np.zeros((stack.frames, 3))
     at_rest = measure_rest(stack, program, monitor, through, sample, begin, at_first)
     try_out = partial(try_recovery, stack, program, monitor, through, sample)
@@ -227,56 +219,6 @@ def _believed(before: float, after: float) -> NDArray[np.bool_]:
     left = max(LEFT * (before**2 - 1), NOTHING_LEFT)
     believed: NDArray[np.bool_] = (after < EXPLAINED) & (after**2 - 1 <= left)
     return believed
-
-
-def _beyond_mask(stack: Stack, sample: PixelSample) -> PixelSample:
-    """A sample of all that sees the monitor, given that of what is to be recovered.
-
-    The bare monitor tells what a camera does better than glass, whose T explains some of it.
-    """
-    return sample if stack.mask().all() else take_sample(stack, masked=False) or sample
-
-
-def _explain(
-    stack: Stack, program: Program, sample: PixelSample, wide: PixelSample, border: BorderValues | None
-) -> tuple[Curve, Patterns, Unexplained] | None:
-    """Find what T leaves unexplained in a sample, local tone mapping first, by a wide one; None if the former has too
-    little contrast.
-
-    Returns
-    -------
-    Curve, Patterns
-        The monitor's curve, and the patterns' light by it, without glare.
-    Unexplained
-    """
-    at_rest, turn = np.zeros((stack.frames, 3)), 0
-    while True:
-        monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
-        light = lay_out(program, monitor, stack.images(), scaled=stack.attributes["scaled"])
-        measured = {name: stack.attributes[name] for name in MEASURED}
-        found = find_unexplained(stack, program, monitor, light, wide, at_rest)
-        mapped = None
-        if found is not None and turn < TONE_MAPPING_TURNS:
-            known = stack.attributes["tone_mapping"]
-            mapped = find_tone_mapping(stack, found.rest, wide, known, _border_light(stack, border))
-        if mapped is None:
-            break
-        measure(stack, border, tone_mapping=mapped)
-        turn += 1
-    if wide is not sample:
-        stack.annotate(**measured)
-        found = find_unexplained(stack, program, monitor, light, sample, at_rest)
-    return None if found is None else (monitor, light, found)
-
-
-def _border_light(stack: Stack, border: BorderValues | None) -> BorderLight | None:
-    """The light of a film's border, if its exposure was locked.
-
-    One that was not follows the patterns, as local tone mapping does, and errors of the curve hide the latter.
-    """
-    if border is None or is_free(stack.attributes["auto_exposure"]):
-        return None
-    return border.fit(look_up_of(stack), local_gain(stack))
 
 
 def _settle(

@@ -5,8 +5,6 @@ import json
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -273,68 +271,6 @@ def test_too_small_a_frame_tells_nothing(ingest: Ingest) -> None:
     stack = ingest("c", target.getvalue())
     assert stack.attributes["steadiness"] is None
     assert stack.attributes["shifts"] is stack.attributes["gains"] is None
-
-
-def measured(exposed: list[float] | None = None, masked: bool = False) -> Stack:
-    """A stack whose curves and noise are known."""
-    attributes = dict.fromkeys(steadiness.MEASURED, 0.0) | {
-        "auto_exposure": exposed,
-        "tone_mapping": None,
-        "monitor_curve": "srgb",
-        "camera_curve": "srgb",
-        "scaled": False,
-        "storage": {"black": 0},
-    }
-    stack = SimpleNamespace(
-        attributes=attributes,
-        annotate=lambda **found: attributes.update(found),
-        dtype=np.dtype(np.uint8),
-        frames=2,
-        images=list,
-        mask=lambda: np.array([True, not masked]),
-    )
-    return cast(Stack, stack)
-
-
-@pytest.mark.parametrize(
-    ("border", "exposed", "asked"),
-    [(True, None, True), (True, [1.0, 1.1], True), (True, [1.0, 2.0], False), (False, None, False)],
-)
-def test_border_tells_tone_mapping_if_the_exposure_was_locked(
-    monkeypatch: pytest.MonkeyPatch, border: bool, exposed: list[float] | None, asked: bool
-) -> None:
-    taken: list[Any] = []
-    values: Any = SimpleNamespace(fit=lambda look_up, local: "light of the border")
-    monkeypatch.setattr(steadiness, "find_unexplained", lambda *given: SimpleNamespace(rest=None))
-    monkeypatch.setattr(steadiness, "find_tone_mapping", lambda *given: taken.append(given[-1]))
-    known = values if border else None
-    sample = cast(Any, None)
-    steadiness._explain(measured(exposed), preset("sketch", 320, 240), sample, sample, known)
-    assert taken == ["light of the border" if asked else None]
-
-
-def test_tone_mapping_is_told_by_pixels_around_the_mask_and_the_rest_by_those_in_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    stack, tried = measured(masked=True), []
-
-    def find_unexplained(*given: Any) -> Any:
-        tried.append((given[4], stack.attributes["model_error"]))
-        stack.annotate(model_error=0.1)
-        return SimpleNamespace(rest=f"rest of {given[4]}")
-
-    def find_tone_mapping(_: Stack, rest: str, sample: str, *known: Any) -> None:
-        assert (rest, sample) == ("rest of all", "all")
-
-    monkeypatch.setattr(steadiness, "take_sample", lambda stack, masked: "masked" if masked else "all")
-    monkeypatch.setattr(steadiness, "find_unexplained", find_unexplained)
-    monkeypatch.setattr(steadiness, "find_tone_mapping", find_tone_mapping)
-    sample = cast(Any, "masked")
-    wide = steadiness._beyond_mask(stack, sample)
-    explained = steadiness._explain(stack, preset("sketch", 320, 240), sample, wide, None)
-    assert explained is not None
-    assert explained[2].rest == "rest of masked"
-    assert tried == [("all", 0.0), ("masked", 0.0)]  # what the first has measured does not count
 
 
 @pytest.mark.parametrize(

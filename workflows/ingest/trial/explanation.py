@@ -1,0 +1,85 @@
+"""What explains a sample of the pixels: a trial recovery of it, without local tone mapping."""
+
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from storage.layout.captures import Stack
+from workflows.images.tone_curves import Curve
+from workflows.ingest.camera.border_exposure import BorderLight, BorderValues
+from workflows.ingest.camera.calibration import is_free, measure
+from workflows.ingest.local_gain import local_gain
+from workflows.ingest.measured_light import look_up_of
+from workflows.ingest.trial.tone_mapping import find_tone_mapping
+from workflows.ingest.trial.trial_recovery import PixelSample, take_sample
+from workflows.ingest.trial.unexplained import MEASURED, Unexplained, find_unexplained
+from workflows.programs.program import Program
+from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.sensing import Patterns
+
+TONE_MAPPING_TURNS = 2
+"""Turns in which local tone mapping is found, and corrected: T has explained some of it before it is."""
+
+
+class Explained(NamedTuple):
+    """What explains a sample.
+
+    Attributes
+    ----------
+    monitor : Curve
+        The monitor's curve.
+    light : Patterns
+        By this curve, without glare.
+    wide : PixelSample
+        A sample of all that sees the monitor.
+    unexplained : Unexplained
+        The last recovery, and what it leaves.
+    """
+
+    monitor: Curve
+    light: Patterns
+    wide: PixelSample
+    unexplained: Unexplained
+
+
+def explain(
+    stack: Stack, program: Program, sample: PixelSample, border: BorderValues | None
+) -> Explained | None:
+    """Find what T leaves unexplained in a sample, local tone mapping first.
+
+    Returns
+    -------
+    Explained or None
+        None if the sample has too little contrast.
+    """
+    # The bare monitor tells what a camera does better than glass, whose T explains some of it.
+    wide = sample if stack.mask().all() else take_sample(stack, masked=False) or sample
+    at_rest, turn = np.zeros((stack.frames, 3)), 0
+    while True:
+        monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
+        light = lay_out(program, monitor, stack.images(), scaled=stack.attributes["scaled"])
+        measured = {name: stack.attributes[name] for name in MEASURED}
+        found = find_unexplained(stack, program, monitor, light, wide, at_rest)
+        mapped = None
+        if found is not None and turn < TONE_MAPPING_TURNS:
+            known = stack.attributes["tone_mapping"]
+            mapped = find_tone_mapping(stack, found.rest, wide, known, _border_light(stack, border))
+        if mapped is None:
+            break
+        measure(stack, border, tone_mapping=mapped)
+        turn += 1
+    if wide is not sample:
+        stack.annotate(**measured)
+        found = find_unexplained(stack, program, monitor, light, sample, at_rest)
+    return None if found is None else Explained(monitor, light, wide, found)
+
+
+def _border_light(stack: Stack, border: BorderValues | None) -> BorderLight | None:
+    """The light of a film's border, if its exposure was locked.
+
+    One that was not follows the patterns, as local tone mapping does, and errors of the curve hide the latter.
+    """
+    if border is None or is_free(stack.attributes["auto_exposure"]):
+        return None
+    return border.fit(look_up_of(stack), local_gain(stack))
