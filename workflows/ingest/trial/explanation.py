@@ -1,4 +1,4 @@
-"""What explains a sample of the pixels: a trial recovery of it, without local tone mapping."""
+"""A trial recovery of a sample of the pixels from frames that show their patterns, without local tone mapping."""
 
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ from workflows.ingest.camera.border_exposure import BorderLight, BorderValues
 from workflows.ingest.camera.calibration import is_free, measure
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import look_up_of
+from workflows.ingest.trial.covered import find_covered
 from workflows.ingest.trial.tone_mapping import find_tone_mapping
 from workflows.ingest.trial.trial_recovery import PixelSample, take_sample
 from workflows.ingest.trial.unexplained import MEASURED, Unexplained, find_unexplained
@@ -46,7 +47,7 @@ class Explained(NamedTuple):
 def explain(
     stack: Stack, program: Program, sample: PixelSample, border: BorderValues | None
 ) -> Explained | None:
-    """Find what T leaves unexplained in a sample, local tone mapping first.
+    """Find the frames in which something covers a part of the object, and what T leaves unexplained without them.
 
     Returns
     -------
@@ -55,6 +56,21 @@ def explain(
     """
     # The bare monitor tells what a camera does better than glass, whose T explains some of it.
     wide = sample if stack.mask().all() else take_sample(stack, masked=False) or sample
+    found = _explain(stack, program, sample, wide, border)
+    if found is not None and find_covered(
+        stack, program, found.monitor, found.unexplained.patterns, sample, found.unexplained.recovered
+    ):
+        # All that was measured with them may be wrong.
+        measure(stack, border)
+        stack.annotate(noise_of_patterns=False)
+        found = _explain(stack, program, sample, wide, border)
+    return found
+
+
+def _explain(
+    stack: Stack, program: Program, sample: PixelSample, wide: PixelSample, border: BorderValues | None
+) -> Explained | None:
+    """Find what T leaves unexplained in a sample, local tone mapping first, by a wide one."""
     at_rest, turn = np.zeros((stack.frames, 3)), 0
     while True:
         monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])

@@ -47,6 +47,7 @@ def test_border_tells_tone_mapping_if_the_exposure_was_locked(
         lambda *given: SimpleNamespace(rest=None, patterns=None, recovered=None),
     )
     monkeypatch.setattr(explanation, "find_tone_mapping", lambda *given: taken.append(given[-1]))
+    monkeypatch.setattr(explanation, "find_covered", lambda *given: False)
     known = values if border else None
     sample = cast(Any, None)
     explanation.explain(measured(exposed), preset("sketch", 320, 240), sample, known)
@@ -69,6 +70,7 @@ def test_tone_mapping_is_told_by_pixels_around_the_mask_and_the_rest_by_those_in
     monkeypatch.setattr(explanation, "take_sample", lambda stack, masked: "masked" if masked else "all")
     monkeypatch.setattr(explanation, "find_unexplained", find_unexplained)
     monkeypatch.setattr(explanation, "find_tone_mapping", find_tone_mapping)
+    monkeypatch.setattr(explanation, "find_covered", lambda *given: False)
     sample = cast(Any, "masked")
     explained = explanation.explain(stack, preset("sketch", 320, 240), sample, None)
     assert explained is not None
