@@ -146,6 +146,7 @@ def _examine_stills(decoder: Decoder, archive: CaptureArchive) -> _Frames:
     attributes = {
         "patterns": [frame.pattern for frame in frames],
         "exposures": [frame.exposure for frame in frames],
+        "files": [frame.file for frame in frames],
         # One orientation for all frames: a camera that looks down detects its orientation at random.
         "orientation": header.orientation,
         "half_colour": header.half_colour,

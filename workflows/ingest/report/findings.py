@@ -8,7 +8,7 @@ import numpy as np
 from workflows.ingest.measured_light import patterns_seen
 from workflows.ingest.report.expected_psnr import costs_of, error_of
 from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
-from workflows.ingest.report.frame_findings import constants, frames, odd_frames, order
+from workflows.ingest.report.frame_findings import constants, frames, named, odd_frames, order
 from workflows.ingest.report.limits import (
     curves,
     is_assumed,
@@ -36,12 +36,13 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     costs = costs_of(
         program, patterns_seen(attributes), survey, error_of(attributes), attributes.get("auto_exposure")
     )
+    files = attributes.get("files")  # missing from films, and captures of earlier versions
     if attributes.get("order"):  # what else would be found means nothing
-        return [order(**attributes["order"]), frames(figures)]
+        return [order(**attributes["order"], files=files), frames(figures)]
     found = [
-        *odd_frames(attributes.get("odd_frames", [])),
+        *odd_frames(attributes.get("odd_frames", []), files),
         # What followed the camera's own exposure is corrected.
-        *constants(None if attributes.get("auto_exposure") else attributes.get("constants_apart")),
+        *constants(None if attributes.get("auto_exposure") else attributes.get("constants_apart"), files),
         *_exposure(figures, attributes["storage"]),
         *_auto_exposure(attributes.get("auto_exposure"), costs["auto_exposure"]),
         *_tone_mapping(attributes.get("tone_mapping")),
@@ -54,7 +55,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *unexplained(costs["model_error"], error_of(attributes)),
         *lost_colour(program, costs["lost_colour"], half_colour=attributes.get("half_colour", False)),
         *_noise(figures, attributes, costs["noise"]),
-        *_flicker(figures.flicker, mapped=bool(attributes.get("tone_mapping"))),
+        *_flicker(figures.flicker, files, mapped=bool(attributes.get("tone_mapping"))),
         frames(figures),
         *quality(figures.quality, any(isinstance(part, Bernoulli) for part in program.parts)),
         *unmeasured(figures, program, attributes),
@@ -166,7 +167,7 @@ def _tone_mapping(found: dict[str, float] | None) -> list[Finding]:
     ]
 
 
-def _flicker(flicker: Flicker | None, *, mapped: bool) -> list[Finding]:
+def _flicker(flicker: Flicker | None, files: list[str] | None, *, mapped: bool) -> list[Finding]:
     if flicker is None:
         return []
     limits = (2.0, 10.0) if flicker.corrected else (0.5, 2.0)
@@ -187,7 +188,8 @@ def _flicker(flicker: Flicker | None, *, mapped: bool) -> list[Finding]:
             name="flicker",
             level=level,
             message=f"the light varies by {flicker.percent:.2f} % between frames, by {flicker.worst_percent:+.1f} % in "
-            f"frame {flicker.worst_frame}" + (": recovery corrects it" if flicker.corrected else ""),
+            f"frame {named([flicker.worst_frame], files)}"
+            + (": recovery corrects it" if flicker.corrected else ""),
             remedy=""
             if level == "good"
             else "switch automatic exposure and the monitor's dimming off, let the monitor warm up, and expose "

@@ -1,10 +1,13 @@
 """Findings on the frames themselves: which there are, and whether they show what they are said to."""
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from workflows.ingest.report.figures import Figures, Finding, graded
 from workflows.ingest.video.missing_patterns import by_reason, ranges, remedy
 
+NAMED = 8
+"""Runs of frames whose files are named, at most: the app translates no longer sentences."""
 SPREAD = 0.25
 """Share of the picture from which on constant frames that differ are bad."""
 
@@ -35,7 +38,7 @@ def frames(figures: Figures) -> Finding:
     )
 
 
-def order(kind: str, first: int, by: int) -> Finding:
+def order(kind: str, first: int, by: int, files: Sequence[str] | None) -> Finding:
     """The frames are in another order than capture.json says; see `workflows.ingest.trial.frame_order.Order`."""
     if kind == "unlike":
         return Finding(
@@ -49,7 +52,7 @@ def order(kind: str, first: int, by: int) -> Finding:
         "reversed": "the frames are in reverse order",
         "rolled": f"the frames are in another order: the first one shows pattern {by}, as when names of files begin "
         "again at 0001",
-        "shifted": f"from frame {first} on each shows a pattern that comes {abs(by)} "
+        "shifted": f"from frame {named([first], files)} on each shows a pattern that comes {abs(by)} "
         + (
             "later than its own: a still is missing"
             if by > 0
@@ -64,7 +67,23 @@ def order(kind: str, first: int, by: int) -> Finding:
     )
 
 
-def odd_frames(odd: list[int]) -> list[Finding]:
+def named(numbers: Iterable[int], files: Sequence[str] | None) -> str:
+    """Ascending numbers of frames in words, with the names of their files, if these are stills.
+
+    Examples
+    --------
+    >>> named([0, 2, 3], ["a/IMG_1.JPG", "a/IMG_2.JPG", "a/IMG_3.JPG", "a/IMG_4.JPG"])
+    '0 (IMG_1.JPG), 2-3 (IMG_3.JPG … IMG_4.JPG)'
+    """
+    words = ranges(numbers)
+    runs = words.split(", ")
+    if files is None or len(runs) > NAMED:
+        return words
+    ends = [[files[int(end)].rpartition("/")[2] for end in run.split("-")] for run in runs]
+    return ", ".join(f"{run} ({' … '.join(of)})" for run, of in zip(runs, ends, strict=True))
+
+
+def odd_frames(odd: list[int], files: Sequence[str] | None) -> list[Finding]:
     """Single frames that do not show their patterns."""
     if not odd:
         return []
@@ -73,13 +92,13 @@ def odd_frames(odd: list[int]) -> list[Finding]:
             name="odd_frames",
             level="warning",
             message="not all frames show their patterns, as with a hand in the picture, a flash, or another still in "
-            f"the place of one: recovery does without {ranges(odd)}",
+            f"the place of one: recovery does without {named(odd, files)}",
             remedy="keep everything still and dark while the patterns are shown, and take one still of each",
         )
     ]
 
 
-def constants(apart: dict[str, Any] | None) -> list[Finding]:
+def constants(apart: dict[str, Any] | None, files: Sequence[str] | None) -> list[Finding]:
     """Frames of black, or of white, that differ."""
     if apart is None:
         return []
@@ -87,7 +106,7 @@ def constants(apart: dict[str, Any] | None) -> list[Finding]:
         Finding(
             name="constants",
             level=graded(apart["share"], 0, SPREAD),
-            message=f"frames {ranges(apart['frames'])} were taken of the same, but differ in "
+            message=f"frames {named(apart['frames'], files)} were taken of the same, but differ in "
             f"{100 * apart['share']:.0f} % of the picture by more than a tenth of white",
             remedy="take all again with exposure and white balance locked, the light of the room as it is, and camera "
             "and glass at rest",

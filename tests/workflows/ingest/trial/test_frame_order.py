@@ -217,7 +217,7 @@ def judged(ingest: Callable[..., Stack], data: bytes) -> tuple[Report, dict[str,
 
 def test_an_odd_frame_is_reported(ingest: Callable[..., Stack], stills: list[Codes], scene: Scene) -> None:
     _, findings = judged(ingest, archive(replaced(stills, {MIDDLE: covered(stills[MIDDLE])}), scene))
-    assert findings["odd_frames"].message.endswith(f": recovery does without {MIDDLE}")
+    assert findings["odd_frames"].message.endswith(f": recovery does without {MIDDLE} ({MIDDLE}.png)")
     assert findings["odd_frames"].level == "warning"
 
 
