@@ -169,7 +169,12 @@ def stills_record(program: "Program", stills: Sequence[Path]) -> tuple[dict[str,
     """The capture.json of a program's first stills, and the files of its archive by name."""
     from workflows.programs.files import program_json
 
-    files = {f"{pattern:05}{still.suffix}": still for pattern, still in enumerate(stills)}
+    def entry(pattern: int, still: Path) -> str:
+        # The report names files as the photographer knows them, but not every name may be in an archive.
+        plain = re.fullmatch(r"[\w .()+-]+", still.name)
+        return f"{pattern:05}/{still.name}" if plain else f"{pattern:05}{still.suffix}"
+
+    files = {entry(pattern, still): still for pattern, still in enumerate(stills)}
     record = {
         "format": "envmatte-capture/1",
         "program": program_json(program),

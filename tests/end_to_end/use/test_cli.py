@@ -107,7 +107,8 @@ def test_films_and_stills_are_packed_with_their_program(tmp_path: Path) -> None:
     with zipfile.ZipFile(archive) as packed:
         found = json.loads(packed.read("capture.json"))
         for n, frame in enumerate(found["frames"]):
-            assert (frame["pattern"], packed.read(frame["file"])) == (n, bytes([n]))
+            assert frame == {"file": f"{n:05}/DSC_{8 + n}.NEF", "pattern": n}
+            assert packed.read(frame["file"]) == bytes([n])
         assert Program.model_validate(found["program"]) == shown
     (stills / "DSC_9.NEF").unlink()
     whole = record.read_text()

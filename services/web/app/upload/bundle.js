@@ -70,7 +70,8 @@ export async function stillsArchive({ stills }, { video, mask, ...record }, sign
 	const patterns = countPatterns(record.program);
 	if (stills.length !== patterns) throw new Problem({ status: 422, title: t("upload.none"), detail: t("stills.count", { n: stills.length, patterns }) });
 	const name = record.name || stills[0].name.replace(/\.\w+$/, "").slice(0, 200);
-	const frames = stills.map((still, pattern) => ({ file: `${String(pattern).padStart(5, "0")}${endOf(still.name).toLowerCase()}`, pattern }));
+	// The report names files as the photographer knows them, but not every character may be in an archive.
+	const frames = stills.map((still, pattern) => ({ file: `${String(pattern).padStart(5, "0")}/${still.name.replace(/[^\w .()+-]/g, "_")}`, pattern }));
 	const text = JSON.stringify({ ...record, name, frames });
 	return zip([["capture.json", new Blob([text])], ...frames.map(({ file }, n) => [file, stills[n]])], signal);
 }
