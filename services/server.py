@@ -1,5 +1,6 @@
 """`envmatte serve`: the API, a coordinator and a cluster in one process tree; and `envmatte coordinator`."""
 
+import gc
 import sys
 import time
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from services.runtime import tracing
 from services.runtime.addresses import bind, url_of
 from services.runtime.data_folder import lock_data, make_data
 from services.runtime.logs import configure_logging
-from services.runtime.malloc import limit_arenas
+from services.runtime.memory import limit_arenas, no_collections
 from services.runtime.signals import exit_on_signal
 from services.settings import CoordinatorSettings, Settings, warn_of_unknown
 from services.webhooks.sender import Sender
@@ -41,14 +42,16 @@ def serve(settings: Settings) -> None:
         If the store is not the one that the database belongs to.
     """
     # A coordinator alone needs none of these, and starts without them.
-    import uvicorn
+    with no_collections():
+        import uvicorn
 
-    from services.api.app import build_app
-    from services.api.auth import require_keys_unless_loopback
-    from services.api.http.browser_security import SecurityHeaders
-    from services.api.http.shutdown import Server
-    from services.api.http.slow_clients import Connection, raise_file_limit
+        from services.api.app import build_app
+        from services.api.auth import require_keys_unless_loopback
+        from services.api.http.browser_security import SecurityHeaders
+        from services.api.http.shutdown import Server
+        from services.api.http.slow_clients import Connection, raise_file_limit
 
+    gc.freeze()  # a full collection of all modules would stop every thread for 0.1 s
     raise_file_limit()
     sys.setswitchinterval(SWITCH_SECONDS)
     with (

@@ -15,7 +15,7 @@ import anyio.to_thread
 from fastapi import Request
 from starlette.requests import ClientDisconnect
 
-from services.runtime.malloc import return_free
+from services.runtime.memory import return_free
 from services.runtime.problems import TooLarge
 from storage.errors import InvalidInput, TooMany
 from workflows.interruption import interruptible

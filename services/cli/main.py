@@ -1,5 +1,6 @@
 """The command `envmatte`: all of its commands, and what errors end it with."""
 
+import gc
 import io
 import re
 import signal
@@ -102,6 +103,8 @@ def run() -> None:
         _end(shown.getvalue().rstrip(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         _end("Interrupted.", 130)
+    finally:
+        gc.freeze()  # Python would search all modules for garbage before it ends: a second for those of a service
 
 
 def _end(message: str, code: int) -> None:

@@ -8,6 +8,7 @@ import click
 
 from services.cli.options import drop_unset
 from services.cli.output import example
+from services.runtime.memory import no_collections
 from storage.errors import InvalidInput
 
 ENDING = signal.SIGTERM, signal.SIGHUP
@@ -74,17 +75,18 @@ class _ProcessCommand(click.Command):
 @click.option("--store", help="Store to use: s3://BUCKET/PREFIX or file:///FOLDER.")
 def serve(**given: Any) -> None:
     """Run the service: API and web app, with database, store and workers on this machine unless others are named."""
-    from services.cluster.dask_config import configure_dask
-    from services.cluster.forkserver import PRELOAD, start_forkserver
-    from services.runtime.kernel_cache import require_kernel_cache
-    from services.settings import Settings
+    with no_collections():
+        from services.cluster.dask_config import configure_dask
+        from services.cluster.forkserver import PRELOAD, start_forkserver
+        from services.runtime.kernel_cache import require_kernel_cache
+        from services.settings import Settings
 
-    settings = Settings(**drop_unset(given))
-    require_kernel_cache()
-    configure_dask()  # which says how processes are started
-    if settings.coordinate and settings.cluster is None:
-        start_forkserver(PRELOAD)  # at the same time as this process imports the rest
-    from services.server import serve as run
+        settings = Settings(**drop_unset(given))
+        require_kernel_cache()
+        configure_dask()  # which says how processes are started
+        if settings.coordinate and settings.cluster is None:
+            start_forkserver(PRELOAD)  # at the same time as this process imports the rest
+        from services.server import serve as run
 
     run(settings)
 

@@ -6,6 +6,7 @@ nanny starts another.
 """
 
 import asyncio
+import gc
 import logging
 import os
 import time
@@ -15,16 +16,18 @@ from distributed import Worker
 from distributed.core import Status
 from tornado.ioloop import PeriodicCallback
 
-# All steps: importing their kernels takes seconds, and the first task of a worker must not wait for it.
-import workflows.composite.video.steps
-import workflows.ingest.steps
-import workflows.mattes.steps  # noqa: F401
 from services.cluster.dask_config import use_steady_clock
 from services.cluster.task import read_key
 from services.runtime import tracing
 from services.runtime.logs import about, configure_worker_logging
-from services.runtime.malloc import keep_memory, limit_arenas
+from services.runtime.memory import keep_memory, limit_arenas, no_collections
 from workflows.untrusted import confinement
+
+# All steps: importing their kernels takes seconds, and the first task of a worker must not wait for it.
+with no_collections():
+    import workflows.composite.video.steps
+    import workflows.ingest.steps
+    import workflows.mattes.steps  # noqa: F401
 
 logger = logging.getLogger(__name__)
 
@@ -42,6 +45,7 @@ NICE = 10
 
 def dask_setup(worker: Worker) -> None:
     """Configure this worker process, and end it when a task runs that is no longer wanted."""
+    gc.freeze()  # a collection would touch, and so copy, all that it shares with the fork server
     use_steady_clock()  # before the worker's callbacks start
     os.nice(NICE)  # of this thread and the ones it starts
     limit_arenas()

@@ -1,9 +1,33 @@
-"""What the processes of a service import: a coordinator alone needs no HTTP API."""
+"""What the processes of a service import: a coordinator alone needs no HTTP API; and what that costs later."""
 
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from tests.parts.processes import running
+
+SEARCHED = """
+import gc, signal
+from services.cli.main import run
+
+searched = []
+
+def count(phase, of):
+    if phase == "start" and of["generation"] == 2:
+        searched.append(len(gc.get_objects()))
+
+def report(number, frame):
+    gc.collect()
+    print(max(searched), flush=True)
+
+gc.callbacks.append(count)
+signal.signal(signal.SIGUSR1, report)
+run()
+"""
+"""Runs a command; on SIGUSR1 prints how many objects a full collection has searched at most."""
 
 
 def loaded_by(*modules: str) -> set[str]:
@@ -24,3 +48,16 @@ def test_no_route_is_imported_before_the_app() -> None:
 @pytest.mark.slow
 def test_routes_are_imported_with_the_app() -> None:
     assert {"services.api.captures.captures", "fastapi"} <= loaded_by("services.api.app")
+
+
+@pytest.mark.slow
+def test_modules_are_not_searched_for_garbage(tmp_path: Path) -> None:
+    options = ["--data", str(tmp_path), "--port", "0", "--workers", "1"]
+    with running([sys.executable, "-c", SEARCHED, "serve", *options]) as service:
+        assert service.stdout is not None
+        assert " at http" in service.stdout.readline()
+        service.send_signal(signal.SIGUSR1)
+        searched = int(service.stdout.readline())
+        service.terminate()
+        service.wait(60)
+    assert searched < 100_000  # of 270,000

@@ -123,11 +123,13 @@ def main(modules: list[str]) -> None:
     # Sent to all processes of a service, they are for the one that started this, which ends it.
     for ignored in (signal.SIGINT, signal.SIGTERM):
         signal.signal(ignored, signal.SIG_IGN)
+    gc.disable()  # no module is garbage
     for module in modules:
         import_module(module)
     load_kernel()  # here it may still be compiled and cached
     os.environ.clear()  # nothing needs it any more
     gc.freeze()  # a collection would touch, and so copy, all memory that decoders share
+    gc.enable()
     control = socket.socket(fileno=0)
     # By the socket that says whether it is wanted: its process, and a pipe that is closed when it ends.
     decoders: dict[socket.socket, tuple[int, int]] = {}

@@ -3,6 +3,8 @@
 import json
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import click
@@ -127,3 +129,12 @@ def test_exit_code_3_if_unreachable_or_busy() -> None:
     assert "envmatte serve" in found.stderr
     with scripted_server(lambda n: refusal(429, **{"Retry-After": "3600"})) as (url, _):
         assert envmatte("status", "j", "--url", url).returncode == 3
+
+
+def test_command_ends_without_a_search_for_garbage() -> None:
+    left = "atexit.register(lambda: print(len(gc.get_objects())))"
+    program = f"import atexit, gc; from services.cli.main import run; {left}; run()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "--version"], capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout.splitlines()[-1]) < 5000

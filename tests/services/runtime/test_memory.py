@@ -1,4 +1,4 @@
-"""Pools of memory that threads of a process share, and memory that is used again."""
+"""Pools of memory that threads of a process share, memory that is used again, and searches for garbage."""
 
 import os
 import subprocess
@@ -8,7 +8,7 @@ import pytest
 
 ARENAS = """
 import ctypes, io, os, re, sys, threading
-from services.runtime.malloc import ARENAS, limit_arenas
+from services.runtime.memory import ARENAS, limit_arenas
 
 limit_arenas()
 together = threading.Barrier(16)
@@ -34,7 +34,7 @@ assert len(re.findall("<heap nr", report)) <= ARENAS, report
 
 KEPT = """
 from resource import RUSAGE_SELF, getrusage
-from services.runtime.malloc import keep_memory
+from services.runtime.memory import keep_memory
 
 def faults() -> int:
     before = getrusage(RUSAGE_SELF).ru_minflt
@@ -51,7 +51,7 @@ assert 10 * kept < returned, (kept, returned)
 
 RETURNED = """
 import psutil
-from services.runtime.malloc import keep_memory, return_free
+from services.runtime.memory import keep_memory, return_free
 
 keep_memory()
 process = psutil.Process()
@@ -61,6 +61,18 @@ del held
 before = process.memory_info().rss
 return_free()
 assert before - process.memory_info().rss > 50 << 20
+"""
+
+IMPORTED = """
+import gc
+from services.runtime.memory import no_collections
+
+before = [of["collections"] for of in gc.get_stats()]
+with no_collections():
+    import fastapi
+    after = [of["collections"] for of in gc.get_stats()]
+assert after == before
+assert gc.isenabled()
 """
 
 
@@ -78,3 +90,7 @@ def test_memory_that_was_freed_is_used_again() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc only")
 def test_free_memory_is_returned_at_once_when_asked() -> None:
     subprocess.run([sys.executable, "-c", RETURNED], check=True, timeout=120)
+
+
+def test_modules_are_imported_without_a_search_for_garbage() -> None:
+    subprocess.run([sys.executable, "-c", IMPORTED], check=True, timeout=120)
