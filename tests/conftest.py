@@ -1,5 +1,7 @@
 """Options, markers and fixtures of all tests."""
 
+import atexit
+import gc
 import os
 import shutil
 import signal
@@ -28,6 +30,18 @@ def pytest_configure() -> None:
     """Handle SIGINT even where a shell started pytest in the background: its jobs, and all they start, ignore it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Search nothing that is imported for garbage, now or later: pytest alone does it five times at the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+        atexit.register(gc.unfreeze)  # libraries that find their own objects at the end call them leaked
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
