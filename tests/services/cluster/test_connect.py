@@ -280,13 +280,13 @@ def test_a_scheduler_stops_at_signals(folder: Path, number: signal.Signals) -> N
 def test_a_scheduler_without_certificates_listens_on_loopback_only(tmp_path: Path) -> None:
     data = {"ENVMATTE_DATA": str(tmp_path)}
     with started(tmp_path / "log", "scheduler", "--host", "0.0.0.0", **data) as process:
-        assert process.wait(60) == 1
+        assert process.wait(60) == 2
     assert "envmatte certs" in (tmp_path / "log").read_text()
     with started(tmp_path / "log", "scheduler", "--port", "0", **data) as process:
         at = address(process)
         assert {ip for ip, _ in listening(psutil.Process(process.pid))} == {"127.0.0.1"}
         with started(tmp_path / "log", "worker", "--cluster", at, "--host", "0.0.0.0", **data) as refused:
-            assert refused.wait(60) == 1
+            assert refused.wait(60) == 2
         assert "without TLS" in (tmp_path / "log").read_text()
         with (
             started(tmp_path / "log", "worker", "--cluster", at, "--workers", "1", **data) as worker,
