@@ -1,4 +1,4 @@
-"""Frames in which something covers a part of the object, by what a trial recovery predicts of them."""
+"""Stills in which something covers a part of the object, by what a trial recovery predicts of them."""
 
 import numpy as np
 
@@ -39,7 +39,7 @@ def find_covered(
     sample: PixelSample,
     found: RecoveredSample,
 ) -> bool:
-    """Find the frames in which something covers a part of the object, and add them to ``odd_frames`` of the stack.
+    """Find the stills in which something covers a part of the object, and add them to ``odd_frames`` of the stack.
 
     Parameters
     ----------
@@ -66,8 +66,9 @@ def find_covered(
     all squares have in common is the exposure.
     """
     is_random = any(isinstance(part, Bernoulli) for part in program.parts)
-    # In another order no frame is like its pattern. Without random patterns, none tells what another one does.
-    if stack.attributes["order"] or not is_random:
+    # The frames of a film were compared when they were matched, and what jolts it would be taken for a hand. In another
+    # order no frame is like its pattern. Without random patterns, none tells what another one does.
+    if "video" in stack.attributes or stack.attributes["order"] or not is_random:
         return False
     before, most = odd_frames(stack.attributes), int(MOST_ODD * stack.frames)
     held: list[int] = []
