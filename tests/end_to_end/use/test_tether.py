@@ -177,7 +177,7 @@ def test_there_is_a_draft_while_a_film_is_recorded(
     assert not [one for one in listed if (one["name"], one["state"]) == ("tethered", "failed")]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_film_that_ends_early_is_recovered_as_far_as_it_goes(
     service: Service, program: Program, recording: bytes, film_json: str, tmp_path: Path
 ) -> None:
