@@ -58,20 +58,20 @@ def score(program: Program, light: Light, looks: Mapping[int, Doubles]) -> float
 
     Notes
     -----
-    Within each part, the inner products of pairs of patterns, on several grids, are correlated with those of pairs of
-    looks (a kernel alignment without the diagonals, Cristianini et al., 2001). It is not necessary to know what part of
-    the monitor a cell of the frame sees. Parts are weighted by how much of their contrast the grids show.
+    Within each part and channel, the inner products of pairs of patterns, on several grids, are correlated with those
+    of pairs of looks (a kernel alignment without the diagonals, Cristianini et al., 2001). It is not necessary to know
+    what part of the monitor a cell of the frame sees. Parts are weighted by how much of their contrast the grids show.
     """
     total = weights = 0.0
     for numbers in _parts(program, looks):
-        seen = _products(np.stack([looks[number].ravel() for number in numbers]))
+        seen = _products(np.stack([looks[number] for number in numbers]))
         shown = np.zeros_like(seen)
         for columns, rows in GRIDS:
-            laid = np.stack([area_mean(light[number], columns, rows).ravel() for number in numbers])
+            laid = np.stack([area_mean(light[number], columns, rows) for number in numbers])
             shown += _products(laid.astype(np.float64))
         random = np.random.Generator(np.random.PCG64(0))
         orders = (random.permutation(len(numbers)) for _ in range(_ORDERS))
-        chance = [float((shown[np.ix_(order, order)] * seen).sum()) for order in orders]
+        chance = [float((shown[:, order][:, :, order] * seen).sum()) for order in orders]
         weight = float(light[numbers].std(axis=0).mean())
         total += (
             weight
@@ -115,10 +115,17 @@ def _parts(program: Program, looks: Mapping[int, Doubles]) -> Iterator[list[int]
             yield numbers
 
 
-def _products(rows: Doubles) -> Doubles:
-    """Inner products of rows, centred and normalised; zero on the diagonal."""
-    rows = rows - rows.mean(axis=0)
-    rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
-    products: Doubles = rows @ rows.T
-    np.fill_diagonal(products, 0)
+def _products(pictures: Doubles) -> Doubles:
+    """Inner products of n pictures, (n, ..., channels), centred and normalised, in each channel.
+
+    Returns
+    -------
+    (channels, n, n) float64
+        Zero on the diagonals.
+    """
+    count, channels = len(pictures), pictures.shape[-1]
+    each = np.moveaxis(pictures - pictures.mean(axis=0), -1, 0).reshape(channels, count, -1)
+    each /= np.maximum(np.linalg.norm(each, axis=2, keepdims=True), 1e-12)
+    products: Doubles = each @ each.transpose(0, 2, 1)
+    products[:, np.arange(count), np.arange(count)] = 0
     return products
