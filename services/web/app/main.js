@@ -1,4 +1,5 @@
 // Shows the view that the part of the URL after `#` names, so that a reload and the back button keep it.
+import { RETRY } from "./lib/api.js";
 import { h, pause, problemBox } from "./lib/dom.js";
 import { refreshActivity } from "./lib/activity.js";
 import { recordings } from "./lib/recordings.js";
@@ -12,7 +13,6 @@ import { languageSwitch, loadWords } from "./lib/language.js";
 import { t } from "./lib/words.js";
 import { offerFilms } from "./upload/upload.js";
 
-const RETRY = 5000; // ms
 const VIEWS = { home: [home], film: [filming, program], captures: [captures, capture], jobs: [jobs, job], mattes: [mattes, matte] };
 const main = document.getElementById("main");
 const note = document.getElementById("recording");

@@ -3,6 +3,7 @@ import { getJson, patchJson } from "../lib/api.js";
 import { ACTIVE } from "../lib/events.js";
 import { button, h, newest, pause, problemBox } from "../lib/dom.js";
 import { followJob } from "../lib/job_progress.js";
+import { showAgain } from "../lib/view.js";
 import { t } from "../lib/words.js";
 
 const LOOK = 3000; // ms between two pictures
@@ -30,7 +31,7 @@ export function recovering(matte, stage, signal, done) {
 		done();
 	}).catch((error) => {
 		if (signal.aborted) return;
-		if (error.isTemporary) dispatchEvent(new HashChangeEvent("hashchange")); // shows the view once the service answers again
+		if (error.isTemporary) showAgain(); // once the service answers
 		else problem.replaceChildren(problemBox(error));
 	});
 	return h("section.panel", { "aria-label": t("progress") }, h("p", t("matte.preview")), h("p.row", halt.button, region), progress, problem);

@@ -1,13 +1,12 @@
 // The picture of the glass. While something moves, this browser draws it, or the service composites a small picture; then
 // the service's composite at full size is shown.
-import { ask, getComposite, received } from "../lib/api.js";
+import { RETRY, ask, getComposite, received } from "../lib/api.js";
 import { h, newest, pause, problemBox, show } from "../lib/dom.js";
 import { decodeLive } from "./live/live_form.js";
 import { LiveGlass } from "./live/live_glass.js";
 import { t } from "../lib/words.js";
 
 const QUICK = 480; // pixels of the longer side of a preview
-const RETRY = 5000; // ms
 
 // Its element sends `moved` before a change, `exact` when the picture shows it at full size, and `unmasked` if there is
 // nothing that a mask left out.

@@ -4,6 +4,7 @@ import { pause } from "./dom.js";
 import { t } from "./words.js";
 
 const TEMPORARY = [0, 429, 502, 503, 504]; // the service is unreachable, busy or starting
+export const RETRY = 5000; // ms until what failed like this is tried again
 const KEY = "envmatte-key"; // the player page keeps it under the same name
 
 export class Problem extends Error {

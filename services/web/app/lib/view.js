@@ -1,5 +1,5 @@
 // What several views have in common: steps, deletion, names, qualities, thumbnails.
-import { remove } from "./api.js";
+import { RETRY, remove } from "./api.js";
 import { button, confirmed, h, newest, pause, show } from "./dom.js";
 import { t } from "./words.js";
 
@@ -17,6 +17,9 @@ export function staying() {
 	const now = view();
 	return () => view() === now;
 }
+
+// Shows the view that is open once more: what it shows has changed.
+export const showAgain = () => dispatchEvent(new HashChangeEvent("hashchange"));
 
 // A button that deletes what a path such as `v1/captures/ID` names; then its list is shown.
 export function deletion(path, where, lost) {
@@ -37,7 +40,6 @@ export const matteName = ({ id, name }) => name || t("matte.unnamed", { id: id.s
 // The name of a file of a matte.
 export const fileName = (matte, kind) => `${matteName(matte).replace(/[^\p{L}\p{N}._-]+/gu, "_")}.${kind}`;
 
-const RETRY = 5000; // ms
 const thumbs = new Map(); // by id: what is ready never changes
 
 // A function that makes thumbnails. Pictures are requested one after the other, and only of what is in view.

@@ -18,7 +18,8 @@ addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) =
 
 // Uploads a capture archive, or a film or stills with their capture.json; without one, asks for their program. A film was
 // filmed in the view `again`. One that was recorded here has an `id`: it can be saved, is kept until its capture is ready,
-// and is discarded only after a question. One with a `warning`, and stills with a `note`, wait for the user; one that is `stored` is kept already.
+// and is discarded only after a question. One with a `warning`, and stills with a `note`, wait for the user; one that is
+// `stored` is kept already.
 export function begin(file, record, { again: view = "#/film", id, at = Date.now(), warning = "", stored = false } = {}) {
 	const film = { id, at, file, record, again: view, warning };
 	const state = { busy: false, unsaved: Boolean(id) && !stored };

@@ -3,7 +3,7 @@ import { getBlob, getJson, patchJson } from "../lib/api.js";
 import { badge, bytes, facts, h, newest, problemBox, prose, sentence, show, size, when } from "../lib/dom.js";
 import { followJob } from "../lib/job_progress.js";
 import { renamable } from "../lib/rename.js";
-import { CHECK, deletion, steps } from "../lib/view.js";
+import { CHECK, deletion, showAgain, steps } from "../lib/view.js";
 import { matteCards } from "./mattes.js";
 import { recoveryForm } from "./recovery_form.js";
 import { verdictOf } from "./report.js";
@@ -39,7 +39,7 @@ export async function capture(main, signal, id) {
 	main.append(panel, form);
 	followJob(panel, found.job, signal).then(async ({ state }) => {
 		if (state === "succeeded" && isAutomatic() && (await getJson(`v1/captures/${id}/report`, signal)).level !== "bad") return start();
-		dispatchEvent(new HashChangeEvent("hashchange")); // shows the view of a capture that is ready or has failed
+		showAgain(); // it is ready, or has failed
 	}).catch((error) => signal.aborted || panel.append(problemBox(error)));
 }
 

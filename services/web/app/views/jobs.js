@@ -7,7 +7,7 @@ import { button, empty, facts, h, newest, pause, problemBox, show, when } from "
 import { ACTIVE } from "../lib/events.js";
 import { list } from "../lib/list.js";
 import { followJob } from "../lib/job_progress.js";
-import { RECOVER, CHECK, deletion, qualityOf, steps } from "../lib/view.js";
+import { RECOVER, CHECK, deletion, qualityOf, showAgain, steps } from "../lib/view.js";
 import { automatic } from "./recovery_form.js";
 import { reportLink } from "./report.js";
 import { t } from "../lib/words.js";
@@ -92,7 +92,7 @@ export async function job(main, signal, id) {
 		panel.replaceChildren();
 		return followJob(panel, id, signal, update, known).catch((error) => {
 			if (signal.aborted) return;
-			if (error.status === 404) dispatchEvent(new HashChangeEvent("hashchange")); // deleted meanwhile: show that it is not found
+			if (error.status === 404) showAgain(); // deleted meanwhile: show that it is not found
 			else panel.append(problemBox(error));
 		});
 	}

@@ -6,7 +6,7 @@ import { compositing } from "../composite/compositing.js";
 import { layers } from "../composite/layers.js";
 import { recovering } from "../composite/recovering.js";
 import { list } from "../lib/list.js";
-import { PLAY, deletion, fileName, matteName, qualityOf, steps, thumbnails } from "../lib/view.js";
+import { PLAY, deletion, fileName, matteName, qualityOf, showAgain, steps, thumbnails } from "../lib/view.js";
 import { parts, t } from "../lib/words.js";
 import { reportLink } from "./report.js";
 import { sharing } from "./sharing.js";
@@ -84,7 +84,7 @@ async function awaitPicture({ id, state }, signal) {
 		now = await getJson(`v1/mattes/${id}`, signal).catch((error) => (error.isTemporary ? { state } : {}));
 	}
 	signal.throwIfAborted();
-	dispatchEvent(new HashChangeEvent("hashchange"));
+	showAgain();
 }
 
 // The newest matte of the same capture in each other quality, by its name.
