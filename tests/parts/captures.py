@@ -3,7 +3,7 @@
 import io
 import json
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,17 +49,26 @@ def captured(program: Program, see: Callable[[int, NDArray[np.uint8]], NDArray[n
         Returns what the camera makes of a pattern, (height, width, channels), 1 being full scale, by its number and its
         picture. It is called for one after another.
     """
+    pictures = enumerate(program.pictures(0, program.count))
+    seen = (np.clip(see(n, picture), 0, 1) for n, picture in pictures)
+    return stills_archive(program, (np.rint(65535 * light).astype(np.uint16) for light in seen))
+
+
+def stills_archive(
+    program: Program, stills: Iterable[NDArray[np.unsignedinteger]], mask: NDArray[np.bool_] | None = None
+) -> bytes:
+    """The archive of a capture in linear light: one still of each pattern, and the pixels to be recovered."""
+    files = {f"{n}.png": encode_png(still) for n, still in enumerate(stills)}
     record = {
         "format": "envmatte-capture/1",
         "program": program.model_dump(mode="json"),
-        "frames": [{"file": f"{n}.png", "pattern": n} for n in range(program.count)],
+        "frames": [{"file": name, "pattern": n} for n, name in enumerate(files)],
         "response": "linear",
     }
-    files = {"capture.json": json.dumps(record).encode()}
-    for n, picture in enumerate(program.pictures(0, program.count)):
-        codes = np.rint(np.clip(see(n, picture), 0, 1) * 65535).astype(np.uint16)
-        files[f"{n}.png"] = encode_png(codes)
-    return zip_bytes(files)
+    if mask is not None:
+        record["mask"] = "mask.png"
+        files["mask.png"] = encode_png(mask[..., np.newaxis].astype(np.uint8) * 255)
+    return zip_bytes({"capture.json": json.dumps(record).encode()} | files)
 
 
 def zip_bytes(files: Mapping[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:

@@ -1,8 +1,5 @@
 """Stills with something before a part of the object, whose thumbnails still look like their patterns."""
 
-import io
-import json
-import zipfile
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -11,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import shift
 
 from storage.layout.captures import Stack
-from workflows.images.integer_formats import encode_png
+from tests.parts.captures import stills_archive
 from workflows.ingest.report.report import report
 from workflows.programs.presets import preset
 from workflows.simulation.glass_ball import glass_ball
@@ -37,20 +34,8 @@ def odd_frames(
     ingest: Ingest, scene: Scene, stills: list[Codes], others: Mapping[int, Codes]
 ) -> tuple[list[int], float]:
     """The frames that are left out, and the share of the light that T does not explain then."""
-    target = io.BytesIO()
-    with zipfile.ZipFile(target, "w") as archive:
-        record = {
-            "format": "envmatte-capture/1",
-            "program": PROGRAM.model_dump(mode="json"),
-            "frames": [{"file": f"{n}.png", "pattern": n} for n in range(len(stills))],
-            "response": "linear",
-            "mask": "mask.png",
-        }
-        archive.writestr("capture.json", json.dumps(record))
-        archive.writestr("mask.png", encode_png(scene.object_mask[..., np.newaxis].astype(np.uint8) * 255))
-        for n, still in enumerate(stills):
-            archive.writestr(f"{n}.png", encode_png(others.get(n, still)))
-    stack = ingest("c", target.getvalue())
+    shown = [others.get(n, still) for n, still in enumerate(stills)]
+    stack = ingest("c", stills_archive(PROGRAM, shown, scene.object_mask))
     odd = stack.attributes["odd_frames"]
     findings = {finding.name: finding for finding in report(stack.attributes, stack.frames).findings}
     assert ("odd_frames" in findings) == bool(odd)

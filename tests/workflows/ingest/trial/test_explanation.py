@@ -1,4 +1,4 @@
-"""What explains a sample: by which pixels local tone mapping and the rest are told."""
+"""What explains a sample: by which pixels local tone mapping and the rest are found."""
 
 from types import SimpleNamespace
 from typing import Any, cast

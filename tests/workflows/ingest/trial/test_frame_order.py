@@ -1,9 +1,6 @@
 """Frames that do not show the patterns that they are said to: in another order, doubled, with a hand or a flash."""
 
-import io
-import json
 import sys
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -17,8 +14,8 @@ from storage.layout import mattes
 from storage.layout.captures import Stack, _thumbnail
 from storage.objects.store import Objects
 from storage.steps import PREPARE
+from tests.parts.captures import stills_archive
 from workflows.composite import composite
-from workflows.images.integer_formats import encode_png
 from workflows.ingest.report.findings import Finding
 from workflows.ingest.report.report import Report, report
 from workflows.ingest.trial.frame_order import check_frames
@@ -193,20 +190,7 @@ def test_light_that_is_switched_on_makes_black_frames_differ(stills: list[Codes]
 
 
 def archive(stills: Sequence[Codes], scene: Scene, program: Program = PROGRAM) -> bytes:
-    target = io.BytesIO()
-    with zipfile.ZipFile(target, "w") as made:
-        record = {
-            "format": "envmatte-capture/1",
-            "program": program.model_dump(mode="json"),
-            "frames": [{"file": f"{n}.png", "pattern": n} for n in range(len(stills))],
-            "response": "linear",
-            "mask": "mask.png",
-        }
-        made.writestr("capture.json", json.dumps(record))
-        made.writestr("mask.png", encode_png(scene.object_mask[..., np.newaxis].astype(np.uint8) * 255))
-        for n, still in enumerate(stills):
-            made.writestr(f"{n}.png", encode_png(still))
-    return target.getvalue()
+    return stills_archive(program, stills, scene.object_mask)
 
 
 def judged(ingest: Callable[..., Stack], data: bytes) -> tuple[Report, dict[str, Finding]]:
