@@ -52,7 +52,7 @@ METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 logger = logging.getLogger(__name__)
 
 
-def answer(problem: dict[str, Any], headers: dict[str, str] | None = None) -> JSONResponse:
+def problem_response(problem: dict[str, Any], headers: dict[str, str] | None = None) -> JSONResponse:
     """A problem detail as a response."""
     return JSONResponse(problem, problem["status"], headers, media_type=MEDIA_TYPE)
 
@@ -69,7 +69,7 @@ def register(app: FastAPI) -> None:
             except StoreUnavailable as away:  # nothing is missing
                 error = away
         base = next((base for base in type(error).__mro__ if base in HEADERS), type(error))
-        return answer(problem_of(error), HEADERS.get(base))
+        return problem_response(problem_of(error), HEADERS.get(base))
 
     @app.exception_handler(HTTPException)
     async def _framework(request: Request, error: HTTPException) -> JSONResponse:
@@ -79,13 +79,13 @@ def register(app: FastAPI) -> None:
         headers = dict(error.headers or {})
         if status == HTTPStatus.METHOD_NOT_ALLOWED:
             headers["Allow"] = ", ".join(sorted(_methods(request)))
-        return answer(problem_detail(status, slug, status.phrase, detail), headers)
+        return problem_response(problem_detail(status, slug, status.phrase, detail), headers)
 
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> JSONResponse:
         name, why = field_and_reason(error.errors())
         place, _, field = name.partition(".")  # of the request: its body, its query or its headers
-        return answer(problem_of(InvalidInput(f"{field or place}: {why}", field=field)))
+        return problem_response(problem_of(InvalidInput(f"{field or place}: {why}", field=field)))
 
     @app.exception_handler(ClientDisconnect)
     async def _disconnected(request: Request, error: ClientDisconnect) -> Response:
@@ -95,7 +95,7 @@ def register(app: FastAPI) -> None:
     async def _unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("%s %s", request.method, request.url.path, exc_info=error)
         # The framework raises the error again, and the server then disconnects.
-        return answer(problem_of(error), {"Connection": "close"})
+        return problem_response(problem_of(error), {"Connection": "close"})
 
 
 def _methods(request: Request) -> set[str]:

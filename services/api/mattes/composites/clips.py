@@ -12,7 +12,7 @@ from sqlalchemy import Connection
 
 from services.api.context import Context, OwnerContext
 from services.api.http.bodies import store_body, upload_limit
-from services.api.http.errors import answer
+from services.api.http.errors import problem_response
 from services.api.http.idempotency import find_earlier, idempotent
 from services.api.http.media_types import JSON, media_type_of
 from services.api.http.router import Router
@@ -112,7 +112,7 @@ def get_video(context: OwnerContext, id: str, request: Request) -> Response:
     if start >= size:
         file.close()
         problem = problem_of(BadRange(f"the video of job {id} has {size} bytes, and none of these"))
-        return answer(problem, {"Content-Range": f"bytes */{size}"})
+        return problem_response(problem, {"Content-Range": f"bytes */{size}"})
     headers = {"Accept-Ranges": "bytes", "Content-Length": str(end - start)}
     part = end - start < size
     if part:

@@ -12,7 +12,7 @@ from starlette.datastructures import Headers
 
 from services.api.context import Context, OwnerContext
 from services.api.http.bodies import BodyLimit, spool_body
-from services.api.http.errors import answer as answer_problem
+from services.api.http.errors import problem_response
 from services.api.http.idempotency import IdempotencyKey
 from services.api.http.media_types import preferred
 from services.api.http.responses import MEMORY_BYTES, VERSION, bytes_response, etag_matches, file_response
@@ -138,7 +138,7 @@ class CompositeRequest:
         times = ServerTiming()
         tag = self._tag(progress, body)
         if etag_matches(headers, tag):
-            return answer_problem(
+            return problem_response(
                 problem_of(NotNeeded(f"the caller already has this composite: {tag}")), {"ETag": tag}
             )
         backdrop = times.take(
