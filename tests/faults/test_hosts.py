@@ -56,6 +56,6 @@ def workers_of(ledger: Path) -> int:
     """The number of workers that the coordinator sees."""
     engine = open_engine(f"sqlite:///{ledger}")
     with reading(engine) as c:
-        sign = leases.last_heartbeat(c)
+        heartbeat = leases.last_heartbeat(c)
     engine.dispose()
-    return len(sign.cluster["workers"]) if sign else 0
+    return len(heartbeat.cluster["workers"]) if heartbeat else 0

@@ -39,8 +39,8 @@ def seconds_left(row: Row[Any], now: float, situation: Situation) -> float | Non
 def seconds_to_recover(connection: Connection, capture: Row[Any]) -> dict[str, float] | None:
     """Seconds that a recovery of a capture will take by quality, by the trial of its ingest and the workers of now."""
     plan = connection.scalar(select(jobs.c.plan).where(jobs.c.id == capture.job)) or {}
-    sign = leases.last_heartbeat(connection)
-    workers = len(sign.cluster["workers"]) if sign else 0
+    heartbeat = leases.last_heartbeat(connection)
+    workers = len(heartbeat.cluster["workers"]) if heartbeat else 0
     if not plan.get("core_seconds") or not workers:
         return None
     edge = block_edge(plan["height"], plan["width"])

@@ -15,18 +15,18 @@ NO_PROGRESS = 30.0
 """Seconds without progress after which a job says so."""
 
 
-def trouble_of(sign: Heartbeat | None) -> str | None:
+def trouble_of(heartbeat: Heartbeat | None) -> str | None:
     """What is wrong with the coordinator or its cluster; None if nothing is."""
-    if sign is None:
+    if heartbeat is None:
         return (
             "no coordinator has ever given a sign of life; start `envmatte serve` or `envmatte coordinator`"
         )
-    if sign.seconds > SILENCE or sign.holder is None:
+    if heartbeat.seconds > SILENCE or heartbeat.holder is None:
         return (
-            f"no coordinator has given a sign of life for {sign.seconds:.0f} s; start `envmatte serve` or "
+            f"no coordinator has given a sign of life for {heartbeat.seconds:.0f} s; start `envmatte serve` or "
             "`envmatte coordinator`, or check that it can reach the database"
         )
-    problem: str | None = sign.cluster["problem"]
+    problem: str | None = heartbeat.cluster["problem"]
     return problem
 
 
@@ -36,11 +36,11 @@ def reason(row: Row[Any], situation: Situation) -> str | None:
         return None
     if row.paused:
         return "it is paused, and does what is left once it is continued"
-    sign = situation.heartbeat
-    trouble = trouble_of(sign)
+    heartbeat = situation.heartbeat
+    trouble = trouble_of(heartbeat)
     if trouble is not None:
         return trouble
-    if sign is not None and row.id in sign.cluster.get("without_store", ()):
+    if heartbeat is not None and row.id in heartbeat.cluster.get("without_store", ()):
         return "its tiles cannot reach the store"
     if row.state == "queued":
         if row.kind == "recover" and row.capture in situation.ingesting:
@@ -50,6 +50,6 @@ def reason(row: Row[Any], situation: Situation) -> str | None:
     if still > NO_PROGRESS:
         return f"no progress in the last {still:.0f} s: a tile takes long, or its worker does not answer"
     if others := situation.running - 1:
-        workers = len(sign.cluster["workers"]) if sign else 0
+        workers = len(heartbeat.cluster["workers"]) if heartbeat else 0
         return f"it shares the workers, {workers} in all, with other jobs: {others}"
     return None

@@ -69,11 +69,11 @@ class Cluster(BaseModel):
 def get_cluster(context: AdminContext) -> Cluster:
     """Workers, threads, memory, the queue, and what is wrong, if anything."""
     with reading(context.engine) as c:
-        sign = leases.last_heartbeat(c)
+        heartbeat = leases.last_heartbeat(c)
         active = [row for row in statistics.job_counts(c) if row.state in ACTIVE]
         missing = sum(statistics.missing_tiles(c).values())
         pace = statistics.tiles_per_second(c)
-    seen = (sign or Heartbeat(None, 0, leases.EMPTY_CLUSTER)).cluster
+    seen = (heartbeat or Heartbeat(None, 0, leases.EMPTY_CLUSTER)).cluster
     workers = [Worker.model_validate(worker) for worker in seen["workers"]]
     limits = [worker.memory_limit_bytes for worker in workers if worker.memory_limit_bytes]
     return Cluster(
@@ -89,8 +89,9 @@ def get_cluster(context: AdminContext) -> Cluster:
             tiles_per_second=pace,
         ),
         coordinator=Coordinator(
-            holder=sign.holder if sign else None, last_sign_seconds=sign.seconds if sign else None
+            holder=heartbeat.holder if heartbeat else None,
+            last_sign_seconds=heartbeat.seconds if heartbeat else None,
         ),
         unconfined_decoders=confinement.missing(),
-        problem=trouble_of(sign),
+        problem=trouble_of(heartbeat),
     )

@@ -120,9 +120,9 @@ def _of_data(connection: Connection) -> Iterator[Metric]:
 
 def _of_the_cluster(connection: Connection) -> Iterator[Metric]:
     """The cluster as its coordinator last saw it."""
-    sign = leases.last_heartbeat(connection)
-    yield _one("trouble", "1 if jobs can't progress; GET /v1/cluster says why.", bool(trouble_of(sign)))
-    cluster = (sign or Heartbeat(None, 0, leases.EMPTY_CLUSTER)).cluster
+    heartbeat = leases.last_heartbeat(connection)
+    yield _one("trouble", "1 if jobs can't progress; GET /v1/cluster says why.", bool(trouble_of(heartbeat)))
+    cluster = (heartbeat or Heartbeat(None, 0, leases.EMPTY_CLUSTER)).cluster
     workers = cluster["workers"]
     yield _one("workers", "Worker processes.", len(workers))
     yield _one("threads", "Threads of all workers.", _sum(workers, "threads"))
@@ -132,9 +132,9 @@ def _of_the_cluster(connection: Connection) -> Iterator[Metric]:
     yield _one(
         "tiles_under_way", "Tiles and steps that the cluster is working on.", cluster.get("under_way", 0)
     )
-    if sign is not None:
+    if heartbeat is not None:
         text = "Seconds since the last sign of life of a coordinator."
-        yield _one("coordinator_last_sign_seconds", text, sign.seconds)
+        yield _one("coordinator_last_sign_seconds", text, heartbeat.seconds)
 
 
 def _sum(workers: list[dict[str, Any]], name: str) -> int:

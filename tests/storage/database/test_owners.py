@@ -127,6 +127,6 @@ def test_every_owner_can_read_the_coordinator(engine: Engine) -> None:
     with writing(engine) as c:
         leases.acquire(c, "me")
     with reading(for_owner(engine, NOBODY)) as c:
-        sign = leases.last_heartbeat(c)
-        assert sign is not None
-        assert sign.holder == "me"
+        heartbeat = leases.last_heartbeat(c)
+        assert heartbeat is not None
+        assert heartbeat.holder == "me"

@@ -37,9 +37,9 @@ def test_lease_from_before_the_clock_went_back_is_free(engine: Engine) -> None:
         values = {"expires_at": dialects.clock() + hour + leases.SECONDS, "beat_at": dialects.clock() + hour}
         c.execute(update(tables.coordinator).values(values))
     with reading(engine) as c:
-        sign = leases.last_heartbeat(c)
-    assert sign is not None
-    assert sign.seconds > hour - 5  # not negative, which would count as alive for an hour
+        heartbeat = leases.last_heartbeat(c)
+    assert heartbeat is not None
+    assert heartbeat.seconds > hour - 5  # not negative, which would count as alive for an hour
     assert acquire(engine, "second") == 2
 
 
@@ -65,11 +65,11 @@ def test_heartbeat_renews_lease(engine: Engine) -> None:
         leases.renew(c, token, {"workers": [{"name": "a"}], "problem": "none"})
     assert acquire(engine, "second") is None
     with reading(engine) as c:
-        sign = leases.last_heartbeat(c)
-    assert sign is not None
-    assert sign.holder == "first"
-    assert sign.cluster == {"workers": [{"name": "a"}], "problem": "none"}
-    assert 0 <= sign.seconds < 5
+        heartbeat = leases.last_heartbeat(c)
+    assert heartbeat is not None
+    assert heartbeat.holder == "first"
+    assert heartbeat.cluster == {"workers": [{"name": "a"}], "problem": "none"}
+    assert 0 <= heartbeat.seconds < 5
 
 
 def test_no_heartbeat_without_coordinator(engine: Engine) -> None:
@@ -92,9 +92,9 @@ def test_commit_of_superseded_coordinator_is_refused(engine: Engine) -> None:
         leases.renew(c, late, {"workers": [], "problem": None})
     with reading(engine) as c:
         assert jobs.get(c, job).done == 0
-        sign = leases.last_heartbeat(c)
-    assert sign is not None
-    assert (sign.holder, token) == ("second", late + 1)
+        heartbeat = leases.last_heartbeat(c)
+    assert heartbeat is not None
+    assert (heartbeat.holder, token) == ("second", late + 1)
 
 
 def test_one_of_many_acquires_the_lease(engine: Engine) -> None:
