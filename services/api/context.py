@@ -16,7 +16,7 @@ from sqlalchemy import Connection, Engine
 from services.api.auth import STRANGER, Caller, bearer, check_method, identify, require_scope
 from services.api.http.browser_security import require_own_site
 from services.api.http.responses import FileStreamResponse
-from services.api.http.together import Together
+from services.api.http.shared_reads import SharedReads
 from services.api.work import Shares, run
 from services.decoding.pool import Decoders
 from services.settings import Settings
@@ -70,7 +70,7 @@ class Context:
     answers: Shares = field(default_factory=lambda: Shares(4 << 30, 2 << 30))
     """Bytes of answers in temporary files until they are read. How many one has is known once it is computed: it begins
     while its owner has less than their share, and may exceed it."""
-    together: Together = field(default_factory=Together)
+    shared_reads: SharedReads = field(default_factory=SharedReads)
     """Reads what streams of events follow."""
     calls: Shares = field(default_factory=lambda: Shares(8, 4))
     """Short calls at once: each takes a thread, and most of them a connection to the database or its write lock."""
@@ -167,8 +167,8 @@ class Context:
             If the key was revoked.
         """
         _, found = await asyncio.gather(
-            self.together.read(self.caller.owner, self.caller, self.check_key),
-            self.together.read(self.caller.owner, what, read),
+            self.shared_reads.read(self.caller.owner, self.caller, self.check_key),
+            self.shared_reads.read(self.caller.owner, what, read),
         )
         return found
 

@@ -1,4 +1,4 @@
-"""Reading together what many requests follow."""
+"""Reads that many requests share, since they follow the same thing."""
 
 import asyncio
 from collections.abc import Callable, Hashable
@@ -11,7 +11,7 @@ INTERVAL = 0.5
 """Seconds between two reads of the same thing."""
 
 
-class Together:
+class SharedReads:
     """Reads what requests follow: all of an owner's at once, and each thing once, however many requests follow it."""
 
     def __init__(self) -> None:
