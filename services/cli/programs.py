@@ -121,11 +121,11 @@ def pack(program: Path, source: Path, output: Path, as_json: bool) -> None:
         stills = stills_in(source, shown)
         if len(stills) < shown.count:
             raise _miscounted(source, len(stills), shown)
-        record, files = stills_record(shown, stills)
+        manifest, files = stills_manifest(shown, stills)
     else:
-        record, files = film_record(program, source)
+        manifest, files = film_manifest(program, source)
     with open_whole(output) as file:
-        write_archive(file, {**record, "name": source.stem}, files)
+        write_archive(file, {**manifest, "name": source.stem}, files)
     print_output(output, as_json)
 
 
@@ -165,7 +165,7 @@ def _miscounted(folder: Path, files: int, program: "Program") -> click.UsageErro
     )
 
 
-def stills_record(program: "Program", stills: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Path]]:
+def stills_manifest(program: "Program", stills: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Path]]:
     """The capture.json of a program's first stills, and the files of its archive by name."""
     from workflows.programs.files import program_json
 
@@ -175,32 +175,32 @@ def stills_record(program: "Program", stills: Sequence[Path]) -> tuple[dict[str,
         return f"{pattern:05}/{still.name}" if plain else f"{pattern:05}{still.suffix}"
 
     files = {entry(pattern, still): still for pattern, still in enumerate(stills)}
-    record = {
+    manifest = {
         "format": "envmatte-capture/1",
         "program": program_json(program),
         "frames": [{"file": file, "pattern": pattern} for pattern, file in enumerate(files)],
     }
-    return record, files
+    return manifest, files
 
 
-def film_record(record: Path, film: Path) -> tuple[dict[str, Any], dict[str, Path]]:
+def film_manifest(program: Path, film: Path) -> tuple[dict[str, Any], dict[str, Path]]:
     """The capture.json of a film of a program, and the files of its archive by name; a usage error if it is of none."""
     entry = f"film{film.suffix}"
     try:
-        found = json.loads(record.read_bytes())
+        found = json.loads(program.read_bytes())
         video = found["video"] | {"file": entry}
         float(video["patterns_per_second"])
     except (ValueError, TypeError, KeyError) as error:
         raise click.UsageError(
-            f"{record} describes no film: name the .json that `envmatte patterns` wrote beside the video it made"
+            f"{program} describes no film: name the .json that `envmatte patterns` wrote beside the video it made"
         ) from error
     return found | {"video": video}, {entry: film}
 
 
-def write_archive(target: BinaryIO | Path, record: Mapping[str, Any], files: Mapping[str, Path]) -> None:
+def write_archive(target: BinaryIO | Path, manifest: Mapping[str, Any], files: Mapping[str, Path]) -> None:
     """Write a capture archive."""
     with zipfile.ZipFile(target, "w", strict_timestamps=False) as archive:
-        archive.writestr("capture.json", json.dumps(record))
+        archive.writestr("capture.json", json.dumps(manifest))
         for name, path in files.items():
             archive.write(path, name)
 

@@ -6,8 +6,8 @@ import zipfile
 from pathlib import Path
 from typing import IO, Any
 
-RECORD = "capture.json"
-RECORD_BYTES = 8 << 20
+MANIFEST = "capture.json"
+MANIFEST_BYTES = 8 << 20
 HEAD = 1 << 16
 """Bytes of an image that are searched for its size."""
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -23,11 +23,11 @@ def declared(file: Path) -> dict[str, int]:
     found: dict[str, int] = {}
     try:
         with zipfile.ZipFile(file) as archive:
-            if archive.getinfo(RECORD).file_size > RECORD_BYTES:
+            if archive.getinfo(MANIFEST).file_size > MANIFEST_BYTES:
                 return found
-            record = json.loads(archive.read(RECORD))
-            frames = record.get("frames") or []
-            found["frames"] = len(frames) or sum(map(_patterns, record["program"]["parts"]))
+            manifest = json.loads(archive.read(MANIFEST))
+            frames = manifest.get("frames") or []
+            found["frames"] = len(frames) or sum(map(_patterns, manifest["program"]["parts"]))
             if frames:
                 with archive.open(frames[0]["file"]) as image:
                     found |= _size(image)

@@ -12,7 +12,7 @@ import click
 
 from services.cli import options
 from services.cli.output import example, print_result
-from services.cli.programs import film_record, shown_program, stills_in, stills_record, write_archive
+from services.cli.programs import film_manifest, shown_program, stills_in, stills_manifest, write_archive
 from services.cli.progress import Progress
 from services.cli.remote.jobs import ingest
 from services.client import Capture, Client, Job, JobFailed, ServiceError
@@ -29,7 +29,7 @@ OVER = 10.0
 
 
 class Taken(NamedTuple):
-    """What the camera has taken by now: the capture's record, its files by name, and whether this is all."""
+    """What the camera has taken by now: the capture's manifest, its files by name, and whether this is all."""
 
     manifest: Mapping[str, Any]
     files: Mapping[str, Path]
@@ -104,8 +104,8 @@ def _stills(folder: Path, program: "Program", name: str) -> Iterator[Taken]:
     stills: Sequence[Path] = ()
     while True:
         stills = _more(folder, len(stills), program)
-        record, files = stills_record(program, stills)
-        yield Taken(record | {"name": name, "unfinished": True}, files, len(stills) == program.count)
+        manifest, files = stills_manifest(program, stills)
+        yield Taken(manifest | {"name": name, "unfinished": True}, files, len(stills) == program.count)
 
 
 def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
@@ -128,9 +128,9 @@ def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
             time.sleep(LOOK)
 
 
-def _film(file: Path, record: Path, name: str) -> Iterator[Taken]:
+def _film(file: Path, program: Path, name: str) -> Iterator[Taken]:
     """The film each time that it has grown by some patterns, and once more when it has ended."""
-    manifest, files = film_record(record, file)
+    manifest, files = film_manifest(program, file)
     manifest |= {"name": name, "unfinished": True}
     pause = FEWEST / manifest["video"]["patterns_per_second"]
     size, grew, taken, due = 0, time.monotonic(), 0, 0.0
