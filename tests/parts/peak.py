@@ -14,7 +14,7 @@ from storage.layout.captures import Stack
 from storage.objects.store import Objects
 from workflows.ingest import steps as ingest_steps
 from workflows.ingest.camera.border_exposure import BorderValues
-from workflows.ingest.camera.calibration import measure
+from workflows.ingest.camera.calibration import calibrate
 from workflows.jobs import Task
 from workflows.untrusted.limits import Limits
 
@@ -33,7 +33,7 @@ def _ingest(objects: Objects, capture: str, memory: int) -> int:
     for tile in range(task.plan["tiles"]):
         ingest_steps.work(objects, task, tile)
     stack = Stack(objects, capture)
-    measure(stack, BorderValues.of(stack))
+    calibrate(stack, BorderValues.of(stack))
     return int(task.plan["tiles"])
 
 

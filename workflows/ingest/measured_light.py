@@ -302,7 +302,7 @@ def constants_of(attributes: dict[str, Any], program: Program) -> tuple[NDArray[
     return numbers, sent
 
 
-def measure(
+def observe(
     light: PatternLight, attributes: dict[str, Any], program: Program, monitor: Curve
 ) -> Observations:
     """Fit S and rho to what pixels saw of constant patterns, and bound what is clipped of the others."""

@@ -18,7 +18,7 @@ from workflows.images.tone_curves import Response
 from workflows.ingest import films, stills
 from workflows.ingest.archive import CaptureArchive
 from workflows.ingest.camera.border_exposure import BorderValues
-from workflows.ingest.camera.calibration import measure
+from workflows.ingest.camera.calibration import calibrate
 from workflows.ingest.manifest import MANIFEST, Manifest, Video
 from workflows.ingest.report.survey import survey
 from workflows.ingest.trial.frame_order import check_frames
@@ -261,7 +261,7 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
     stack = Stack(objects, task.capture)
     border = BorderValues.of(stack)
     check_frames(stack)
-    measure(stack, border)
+    calibrate(stack, border)
     seconds = _try_out(stack, border)
     survey(stack, border)
     stack.save()

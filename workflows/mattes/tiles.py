@@ -14,7 +14,7 @@ from storage.layout.mattes import Block, Matte, empty_block
 from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve
 from workflows.ingest.local_gain import Surroundings, local_gain
-from workflows.ingest.measured_light import conditions_of, measure, places_in, read_light
+from workflows.ingest.measured_light import conditions_of, observe, places_in, read_light
 from workflows.mattes.cut_out import CutOut
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
@@ -150,7 +150,7 @@ def recover_block(
     gain = gain_of(objects, capture)
     light, recovered = read_light(stack, span, program, gain, wanted)
     crosstalk = np.array(attributes["crosstalk"])
-    photometry, measurements, usable, worth = measure(light, attributes, program, monitor)
+    photometry, measurements, usable, worth = observe(light, attributes, program, monitor)
     given = (noise, usable, worth)
     places = places_in(span, recovered)
     method, conditions = options.of_method, conditions_of(stack, program)

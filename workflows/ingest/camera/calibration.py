@@ -1,4 +1,4 @@
-"""Measure the camera from constant frames: its noise, its crosstalk, and unknown tone curves."""
+"""Calibrate the camera from constant frames: its noise, its crosstalk, and unknown tone curves."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -73,7 +73,7 @@ def _places(square: tuple[slice, slice], chosen: NDArray[np.bool_]) -> NDArray[n
     return places
 
 
-def measure(
+def calibrate(
     stack: Stack,
     border: BorderValues | None = None,
     gains: Sequence[float] | None = None,

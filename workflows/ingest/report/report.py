@@ -33,7 +33,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
     Parameters
     ----------
     attributes : dict
-        Attributes of its stack after `measure` and `survey`.
+        Attributes of its stack after `calibrate` and `survey`.
     frames : int
         Number of frames in the stack.
     """

@@ -12,7 +12,7 @@ from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.camera.border_exposure import BorderValues, shortest_white
-from workflows.ingest.camera.calibration import constant_frames, is_free, measure
+from workflows.ingest.camera.calibration import calibrate, constant_frames, is_free
 from workflows.ingest.camera.lit import find_lit, windows
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
@@ -46,7 +46,7 @@ def survey(stack: Stack, border: BorderValues | None = None) -> None:
     """
     if stack.attributes["gains"] is not None and not is_free(stack.attributes["auto_exposure"]):
         noise = stack.attributes["noise"]
-        measure(stack, border, stack.attributes["gains"], stack.attributes["tone_mapping"])
+        calibrate(stack, border, stack.attributes["gains"], stack.attributes["tone_mapping"])
         if stack.attributes["noise_of_patterns"]:
             stack.annotate(noise=noise)
     program = Program.model_validate(stack.attributes["program"])

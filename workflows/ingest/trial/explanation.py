@@ -8,7 +8,7 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
 from workflows.ingest.camera.border_exposure import BorderLight, BorderValues
-from workflows.ingest.camera.calibration import is_free, measure
+from workflows.ingest.camera.calibration import calibrate, is_free
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import look_up_of
 from workflows.ingest.trial.covered import find_covered
@@ -61,7 +61,7 @@ def explain(
         stack, program, found.monitor, found.unexplained.patterns, sample, found.unexplained.recovered
     ):
         # All that was measured with them may be wrong.
-        measure(stack, border)
+        calibrate(stack, border)
         stack.annotate(noise_of_patterns=False)
         found = _explain(stack, program, sample, wide, border)
     return found
@@ -83,7 +83,7 @@ def _explain(
             mapped = find_tone_mapping(stack, found.rest, wide, known, _border_light(stack, border))
         if mapped is None:
             break
-        measure(stack, border, tone_mapping=mapped)
+        calibrate(stack, border, tone_mapping=mapped)
         turn += 1
     if wide is not sample:
         stack.annotate(**measured)

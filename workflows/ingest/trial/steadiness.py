@@ -72,7 +72,7 @@ def find_steadiness(
     Parameters
     ----------
     stack : Stack
-        With its attributes after `measure`.
+        With its attributes after `calibrate`.
     sample : PixelSample, optional
         As from `take_sample`.
     border : BorderValues, optional

@@ -21,7 +21,7 @@ from workflows.ingest.measured_light import (
     exposures_of,
     light_of,
     look_up_of,
-    measure,
+    observe,
     odd_frames,
     unclipped_light,
 )
@@ -245,7 +245,7 @@ def recover_seen(
     attributes = stack.attributes | {"gains": np.exp(gains).tolist() if gains.any() else None}
     noise = NoiseModel(**attributes["noise"])
     found = light_of(lambda n: (seen.values[n], seen.whole[n]), attributes, program, seen.values.shape[1])
-    photometry, measurements, used, worth = measure(found, attributes, program, monitor)
+    photometry, measurements, used, worth = observe(found, attributes, program, monitor)
     alive = photometry.rho**2 > CONTRAST**2 * noise.variance(photometry.S + photometry.rho / 2)
     if np.count_nonzero(alive.any(axis=1)) < MIN_PIXELS:
         return None

@@ -15,7 +15,7 @@ from tests.parts.captures import nested_program
 from workflows.images.integer_formats import decode, encode_png
 from workflows.images.tone_curves import table
 from workflows.ingest.camera.border_exposure import BorderValues
-from workflows.ingest.camera.calibration import MOST_APART, measure
+from workflows.ingest.camera.calibration import MOST_APART, calibrate
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
 from workflows.recovery.camera.noise import NoiseModel
@@ -29,7 +29,7 @@ NOISE, UNEVEN = 0.002, 0.2
 
 
 class Film:
-    """What `measure` needs of a stack: a film whose patterns are brighter or darker, by 20 %, than its border tells."""
+    """A film, as `calibrate` needs it: its patterns are brighter or darker, by 20 %, than its border tells."""
 
     channels, height, width, dtype = 3, 60, 80, np.dtype(np.uint16)
 
@@ -91,7 +91,7 @@ def deviation(film: Film) -> float:
 def test_uneven_patterns_are_noise_unless_the_exposure_was_free(free: bool) -> None:
     steps = np.array([1.0, 1.2 * MOST_APART if free else 1.1])[np.arange(PROGRAM.count) % 2]
     film = cast(Any, Film(steps))
-    measure(film, BorderValues.of(film))
+    calibrate(film, BorderValues.of(film))
     np.testing.assert_allclose(
         np.ptp(np.log(film.attributes["auto_exposure"])), np.log(steps.max()), atol=0.05
     )
