@@ -51,8 +51,8 @@ from workflows.untrusted.limits import Limits
 WIDTH, HEIGHT = 16, 12
 MONITOR = 256, 192
 LIMITS = Limits(unpacked=1 << 28, memory=1 << 26)
-LOOK = 0.5
-"""Seconds after which the kernels that are there are counted again."""
+POLL = 0.5
+"""Seconds between two counts of the kernels that are there."""
 
 
 class Compiled(NamedTuple):
@@ -93,7 +93,7 @@ def compile_kernels(progress: Callable[[float, str], None] = lambda share, what:
         misses = 0
         while left:
             progress(min(_written_since(began) / entries, 0.99), ", ".join(left.values()))
-            done, _ = wait(left, LOOK, FIRST_COMPLETED)
+            done, _ = wait(left, POLL, FIRST_COMPLETED)
             for future in done:
                 misses += future.result()
                 del left[future]

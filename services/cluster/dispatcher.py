@@ -25,12 +25,14 @@ from workflows.jobs import Steps, Task
 
 logger = logging.getLogger(__name__)
 
-LOOK = 1.0
+POLL = 1.0
 """Seconds between two polls of the cluster."""
 ANSWER = 5.0
 """Seconds that the scheduler has to answer."""
-LOOKING, SELDOM = 0.05, 5.0
-"""The share of its time for which it looks at most, since a thousand workers take long, and yet after these seconds."""
+POLL_SHARE = 0.05
+"""The share of its time that it polls for, at most: a poll of a thousand workers takes long."""
+LONGEST_PAUSE = 5.0
+"""Seconds between two polls at most, however long one takes."""
 MEMORY = "worker-restart-memory"
 """The topic under which a nanny reports to the scheduler that it ends its worker for taking too much memory."""
 
@@ -254,7 +256,7 @@ class Dispatcher:
     def _watch(self) -> None:
         while True:
             start = time.monotonic()
-            cluster = self._look()
+            cluster = self._poll()
             took = time.monotonic() - start
             changed = cluster["problem"] != self.cluster["problem"] or self.threads != sum(
                 worker["threads"] for worker in cluster["workers"]
@@ -264,10 +266,10 @@ class Dispatcher:
             self.cluster = cluster
             if changed:
                 self.news.set()
-            if self._stopped.wait(min(max(LOOK, took / LOOKING), SELDOM)):
+            if self._stopped.wait(min(max(POLL, took / POLL_SHARE), LONGEST_PAUSE)):
                 return
 
-    def _look(self) -> dict[str, Any]:
+    def _poll(self) -> dict[str, Any]:
         client: Any
         try:
             client = self._usable()

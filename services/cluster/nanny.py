@@ -14,8 +14,8 @@ logger = logging.getLogger(__name__)
 
 PAUSE = 0.5
 """Seconds between two attempts to start a worker process."""
-LOOK = 2.0
-"""Seconds between two looks at what worker processes need."""
+POLL = 2.0
+"""Seconds between two checks of what worker processes need."""
 SERVER_DIED = (EOFError, AttributeError)
 """What distributed raises if the fork server dies after it has taken a request, or before: an `AttributeError` then
 hides the `OSError`, since distributed wants to end a process that was never started."""
@@ -30,7 +30,7 @@ class Nanny(distributed.Nanny):  # type: ignore[misc]
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self.periodic_callbacks["servers"] = PeriodicCallback(ensure_running, LOOK * 1e3)
+        self.periodic_callbacks["servers"] = PeriodicCallback(ensure_running, POLL * 1e3)
 
     async def instantiate(self) -> Status:
         """Start the worker process, or wait until it has started."""

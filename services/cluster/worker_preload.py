@@ -31,7 +31,7 @@ with no_collections():
 
 logger = logging.getLogger(__name__)
 
-LOOK = 0.2
+POLL = 0.2
 """Seconds between two checks of what runs."""
 PATIENCE = 0.5
 """Seconds that a task may continue after it was cancelled."""
@@ -81,7 +81,7 @@ def dask_setup(worker: Worker) -> None:
                 os._exit(1)
 
     # Not one of the worker's own callbacks, which stop when it begins to close.
-    PeriodicCallback(end_strays, 1000 * LOOK).start()
+    PeriodicCallback(end_strays, 1000 * POLL).start()
 
 
 async def dask_teardown(worker: Worker) -> None:

@@ -39,8 +39,8 @@ from storage.records.uploads import MAX_PARTS
 
 PART = 64 << 20
 """Bytes after which a part is recorded: the most that a killed server loses of one PATCH."""
-LOOK = 1.0
-"""Seconds between two looks of a writer whether another request wants its upload."""
+POLL = 1.0
+"""Seconds between two checks of a writer whether another request wants its upload."""
 
 router = Router(prefix="/uploads", tags=["uploads"])
 Versioned = Depends(require_version)
@@ -136,7 +136,7 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
     size = min(limit.check_announced(request, row.offset), STEP)
     writer = new_id()
     await _claim(context, row, writer, size)
-    reservation = Reservation(context, writer, size, row.length - row.offset, LOOK)
+    reservation = Reservation(context, writer, size, row.length - row.offset, POLL)
     # A client that falls silent is disconnected, see `services.api.http.slow_clients`.
     body = reservation.watch(limit.stream(request, row.offset))
     stored: list[Part] = []
@@ -204,7 +204,7 @@ async def _claim(context: Context, row: Row[Any], writer: str, size: int) -> Non
     await context.call(ask)
     deadline = time.monotonic() + bodies.PATIENCE
     while time.monotonic() < deadline:
-        await anyio.sleep(LOOK / 4)
+        await anyio.sleep(POLL / 4)
         if await context.call(claim):
             return
     raise Conflict(f"another request is writing upload {row.id}; request its offset and continue from there")

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 FEWEST = 8
 """Patterns that tell T in the first draft, and more of a film at least in the next."""
-LOOK = 0.5
-"""Seconds between two looks at what the camera has taken. A still counts once it is as large as at the look before."""
+POLL = 0.5
+"""Seconds between two polls of what the camera has taken. A still counts once it is as large as at the poll before."""
 OVER = 10.0
 """Seconds after which a film that has not grown is taken as ended: recorders write every five, or more often."""
 
@@ -125,7 +125,7 @@ def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
             if count > before and (enough or count == program.count):
                 return complete
             sizes = now
-            time.sleep(LOOK)
+            time.sleep(POLL)
 
 
 def _film(file: Path, program: Path, name: str) -> Iterator[Taken]:
@@ -142,7 +142,7 @@ def _film(file: Path, program: Path, name: str) -> Iterator[Taken]:
         if over or (size > taken and time.monotonic() >= due):
             taken, due = size, time.monotonic() + pause
             yield Taken(manifest, files, over)
-        time.sleep(LOOK)
+        time.sleep(POLL)
 
 
 def _next_capture(client: Client, takes: Iterator[Taken], draft: Job | None) -> tuple[Capture, bool]:
@@ -175,7 +175,7 @@ def _recover_draft(client: Client, capture: Capture) -> Job:
                 raise JobFailed(job)
             if job.stage == "recovering" and client.matte(job)["preview"]:
                 break
-            time.sleep(LOOK)
+            time.sleep(POLL)
             job = client.job(job)
             bar.job(job)
     return job
