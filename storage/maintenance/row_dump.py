@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby, islice
-from typing import Any
+from typing import Any, get_args
 
 from sqlalchemy import (
     JSON,
@@ -33,6 +33,11 @@ from storage.database.engine import reading
 from storage.database.revision import revision
 from storage.database.tables import metadata
 from storage.errors import Conflict, InvalidInput
+from storage.records.captures import State as CaptureState
+from storage.records.jobs import Kind
+from storage.records.jobs import State as JobState
+from storage.records.mattes import State as MatteState
+from storage.records.tiles import State as TileState
 
 SKIPPED = ("coordinator", "installation", "deliveries", "bodies")
 OF_ROWS = {"links": "matte", "tiles": "job", "log": "job"}
@@ -43,11 +48,11 @@ ID = re.compile("[A-Za-z0-9_-]{1,64}")
 """Ids become names of folders in the store, so none may lead out of it."""
 IDS = ("id", "capture", "matte", "job", "upload")
 CHOICES = {
-    "captures.state": ("ingesting", "ready", "failed"),
-    "mattes.state": ("recovering", "ready", "failed"),
-    "jobs.kind": ("ingest", "recover", "composite"),
-    "jobs.state": ("queued", "running", "succeeded", "failed", "cancelled"),
-    "tiles.state": ("queued", "done", "missing", "failed"),
+    "captures.state": get_args(CaptureState),
+    "mattes.state": get_args(MatteState),
+    "jobs.kind": get_args(Kind),
+    "jobs.state": get_args(JobState),
+    "tiles.state": get_args(TileState),
 }
 """The values of columns that the code takes to have no others."""
 LATEST = 253402300799

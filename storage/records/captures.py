@@ -1,12 +1,13 @@
 """Rows of captures."""
 
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import Connection, Row, Text, cast, insert, select, update
 
 from storage.database.rows import find, json_bytes, lifetime
 from storage.database.tables import captures
 
+State = Literal["ingesting", "ready", "failed"]
 WITHOUT = ("program",)
 """What is not read with a row: it may have megabytes, and while JSON is parsed all threads wait."""
 

@@ -7,7 +7,7 @@ any time.
 
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import ColumnElement, Connection, Row, func, insert, select, update
 
@@ -18,6 +18,8 @@ from storage.database.tables import log as lines
 from storage.errors import Conflict
 from storage.records import webhook_deliveries
 
+Kind = Literal["ingest", "recover", "composite"]
+State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 ACTIVE = ("queued", "running")
 
 

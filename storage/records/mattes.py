@@ -1,12 +1,14 @@
 """Rows of mattes."""
 
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import Connection, Row, insert, update
 
 from storage.database.rows import find, lifetime
 from storage.database.tables import mattes
 from storage.errors import Conflict
+
+State = Literal["recovering", "ready", "failed"]
 
 
 def add(

@@ -8,7 +8,7 @@ it is done again.
 
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import Column, Connection, bindparam, insert, select, update
 
@@ -17,6 +17,7 @@ from storage.database.tables import jobs, tiles, totals
 from storage.records.jobs import get, log
 from storage.steps import FINISH, PREPARE, step_name
 
+State = Literal["queued", "done", "missing", "failed"]
 REMAINING = ("queued", "missing")
 
 

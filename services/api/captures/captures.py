@@ -2,7 +2,7 @@
 
 import json
 from datetime import UTC, datetime
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 from fastapi import Request, Response
 from pydantic import BaseModel, Field
@@ -34,7 +34,7 @@ class ListedCapture(BaseModel):
 
     id: str
     name: str
-    state: Literal["ingesting", "ready", "failed"]
+    state: captures.State
     job: str
     width: int | None
     height: int | None
@@ -93,7 +93,7 @@ async def list_captures(
     request: Request,
     limit: PageSize = 100,
     after: After = None,
-    state: Literal["ingesting", "ready", "failed"] | None = None,
+    state: captures.State | None = None,
     name: Named = None,
 ) -> Response:
     """Captures, newest first, without their programs."""

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from functools import partial
 from itertools import islice
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
@@ -37,7 +37,6 @@ router = Router(tags=["jobs"])
 CALL = "POST /v1/jobs"
 REQUEST_BYTES = 64 << 10
 ROWS_AT_ONCE = 20
-State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 
 class Region(BaseModel):
@@ -108,7 +107,7 @@ class Job(BaseModel):
         description="`ingest`, `recover` or `composite`; a newer service may have queued others."
     )
     name: str
-    state: State
+    state: jobs.State
     stage: str
     progress: float
     tiles: Tiles
@@ -287,7 +286,7 @@ async def list_jobs(
     request: Request,
     limit: PageSize = 100,
     after: After = None,
-    state: State | None = None,
+    state: jobs.State | None = None,
 ) -> Response:
     """Jobs, newest first."""
 

@@ -3,7 +3,7 @@
 import re
 from contextlib import suppress
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Any
 from urllib.parse import quote
 
 from fastapi import Request, Response
@@ -30,7 +30,7 @@ class Matte(BaseModel):
 
     id: str
     name: str
-    state: Literal["recovering", "ready", "failed"]
+    state: mattes.State
     capture: str | None
     job: str | None
     options: dict[str, Any]
@@ -82,7 +82,7 @@ async def list_mattes(
     request: Request,
     limit: PageSize = 100,
     after: After = None,
-    state: Literal["recovering", "ready", "failed"] | None = None,
+    state: mattes.State | None = None,
     capture: str | None = None,
     name: Named = None,
 ) -> Response:

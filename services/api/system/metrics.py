@@ -1,7 +1,7 @@
 """Metrics for Prometheus, from the database, so that every process of the service reports the same."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, get_args
 
 from fastapi import Request, Response
 from prometheus_client import CollectorRegistry, Metric
@@ -15,15 +15,11 @@ from services.api.http.router import Router
 from services.api.jobs.wait_reason import trouble_of
 from storage import statistics
 from storage.database.engine import reading
-from storage.records import leases
-from storage.records.jobs import ACTIVE
+from storage.records import captures, jobs, leases, mattes
 from storage.records.leases import Heartbeat
 
 router = Router(tags=["system"])
-KINDS = ("ingest", "recover", "composite")
-JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
-CAPTURE_STATES = ("ingesting", "ready", "failed")
-MATTE_STATES = ("recovering", "ready", "failed")
+KINDS: tuple[str, ...] = get_args(jobs.Kind)
 MEDIA_TYPES = ("text/plain", "application/openmetrics-text")
 Labelled = Iterable[tuple[tuple[str, ...], float]]
 
@@ -61,13 +57,13 @@ def get_metrics(context: AdminContext, request: Request) -> Response:
 def _of_the_queue(connection: Connection) -> Iterator[Metric]:
     """Jobs, and the tiles of active jobs."""
     rows = {(row.kind, row.state): row for row in statistics.job_counts(connection)}
-    numbers = {(kind, state): 0 for kind in KINDS for state in JOB_STATES}
+    numbers = {(kind, state): 0 for kind in KINDS for state in get_args(jobs.State)}
     numbers |= {labels: row.number for labels, row in rows.items()}
     yield _gauge("jobs", "Jobs by kind and state.", ("kind", "state"), numbers.items())
     missing = statistics.missing_tiles(connection)
     states: dict[tuple[str, ...], int] = {}
     for kind in KINDS:
-        active = [row for (one, state), row in rows.items() if one == kind and state in ACTIVE]
+        active = [row for (one, state), row in rows.items() if one == kind and state in jobs.ACTIVE]
         total, done, failed = (
             sum(getattr(row, name) for row in active) for name in ("total", "done", "failed")
         )
@@ -108,9 +104,9 @@ def _of_data(connection: Connection) -> Iterator[Metric]:
         ("captures", "number", "Captures by state."),
         ("capture_bytes", "bytes", "Bytes of the uploaded archives of captures."),
     ):
-        yield _gauge(name, text, ("state",), _of_each(CAPTURE_STATES, rows, column))
+        yield _gauge(name, text, ("state",), _of_each(get_args(captures.State), rows, column))
     found = statistics.matte_counts(connection)
-    values = [((state,), found.get(state, 0)) for state in MATTE_STATES]
+    values = [((state,), found.get(state, 0)) for state in get_args(mattes.State)]
     yield _gauge("mattes", "Mattes by state.", ("state",), values)
     uploads = statistics.upload_counts(connection)
     yield _one("uploads", "Resumable uploads under way.", uploads.number)
