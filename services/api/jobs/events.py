@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from services.api.context import Context, OwnerContext
 from services.api.http.router import Router
-from services.api.jobs.jobs import Job
+from services.api.jobs.job import Job
 from services.runtime.problems import Unauthorized
 from storage.database.engine import reading
 from storage.errors import NotFound, Unavailable

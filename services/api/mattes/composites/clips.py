@@ -16,7 +16,7 @@ from services.api.http.errors import problem_response
 from services.api.http.idempotency import find_earlier, idempotent
 from services.api.http.media_types import JSON, media_type_of
 from services.api.http.router import Router
-from services.api.jobs.jobs import Job
+from services.api.jobs.job import Job
 from services.api.limits.quotas import admit
 from services.api.limits.reservations import reserved
 from services.runtime import tracing

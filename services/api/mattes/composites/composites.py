@@ -18,7 +18,7 @@ from services.api.http.media_types import preferred
 from services.api.http.responses import MEMORY_BYTES, VERSION, bytes_response, etag_matches, file_response
 from services.api.http.router import Router
 from services.api.http.server_timing import ServerTiming
-from services.api.jobs.jobs import Job
+from services.api.jobs.job import Job
 from services.api.mattes.composites import clips
 from services.api.mattes.composites.backdrops import decode_backdrop, refuse_form
 from services.api.mattes.composites.drawing import Drawing, Picture

@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import Engine, event
 
 from services.api.app import build_app
-from services.api.jobs.jobs import Job
+from services.api.jobs.job import Job
 from services.settings import Settings
 from storage.database.engine import reading, writing
 from storage.database.rows import page
