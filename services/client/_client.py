@@ -1,24 +1,20 @@
 """The client's calls."""
 
-import os
 import secrets
-import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
 
+from services.client import _download
 from services.client._errors import JobFailed, NotFound
 from services.client._paths import id_of, path_of
 from services.client._records import Capture, Job, Layers, Matte, Record
-from services.runtime.whole_files import is_standard_output, open_whole
 
 if TYPE_CHECKING:
     from services.client._arrays import Floats
 
-PIECE = 8 << 20
-"""Bytes of a video in one request."""
 _PAGE = 100
 """Records that are read at a time."""
 SENT = 64 << 10
@@ -300,12 +296,7 @@ class Client:
 
     def video(self, job: Job | str, target: BinaryIO) -> None:
         """Write the video of a composite job, an MP4, to a file, a few megabytes at a time."""
-        at, size = 0, 1
-        while at < size:
-            asked = {"Range": f"bytes={at}-{at + PIECE - 1}"}
-            answer = self._http.send("GET", f"{path_of(Job, job)}/video.mp4", headers=asked)
-            at += target.write(answer.content)
-            size = int(answer.headers.get("Content-Range", f"/{at}").rpartition("/")[2])
+        _download.by_ranges(self._http, f"{path_of(Job, job)}/video.mp4", target)
 
     def layer(self, matte: Matte | str, name: str, *, plate: bool = False) -> bytes:
         """Get a layer of a matte as a file, such as ``confidence.png``; ``Matte.layers`` has them as arrays.
@@ -343,21 +334,7 @@ class Client:
         progress : callable, optional
             Is called with the bytes received, and with all there are.
         """
-        with open_whole(file) as out:
-            may_restart = stat.S_ISREG(os.fstat(out.fileno()).st_mode) and not is_standard_output(file)
-
-            def get() -> None:
-                with self._http.streamed("GET", f"{path_of(Matte, matte)}/archive") as answer:
-                    size, done = int(self._http.header(answer, "Content-Length")), 0
-                    if may_restart:
-                        out.seek(0)
-                        out.truncate()
-                    for data in answer.iter_bytes():
-                        done += out.write(data)
-                        if progress:
-                            progress(done, size)
-
-            self._http.patiently(get, safe=may_restart)
+        _download.whole(self._http, f"{path_of(Matte, matte)}/archive", file, progress)
 
     def import_matte(
         self, file: Path, *, name: str = "", progress: Callable[[int, int], None] | None = None
