@@ -115,7 +115,7 @@ async def _from_body(
     async with reserved(context, capture, length, most, remove=remove, captures=1, jobs=1) as reservation:
         pieces = reservation.watch(limit.stream(request))
         parts = [await store_as_upload(pieces, context.objects, capture)]
-        register = partial(_register, context, capture, parts, name, key, False, webhook)
+        register = partial(_register, context, capture, parts, key, name=name, webhook=webhook)
         row = await context.compute(request, context.captures, register, memory=CHECK_BYTES)
     if row.id != capture:  # a concurrent request with the same key was quicker
         await anyio.to_thread.run_sync(remove)
@@ -141,7 +141,14 @@ def _from_upload(context: Context, given: FromUpload, key: str | None) -> Row[An
         )
     try:
         return _register(
-            context, upload, parts, given.name, key, True, given.webhook, otherwise=file_name(row.metadata)
+            context,
+            upload,
+            parts,
+            key,
+            name=given.name,
+            webhook=given.webhook,
+            file=file_name(row.metadata),
+            resumable=True,
         )
     except (CaptureError, Corrupt, FileNotFoundError, NotFound) as error:
         is_useless = not isinstance(error, NotFound)  # it would be refused again
@@ -169,20 +176,30 @@ def _register(
     context: Context,
     capture: str,
     parts: list[Part],
-    name: str,
     key: str | None,
-    resumable: bool,
+    *,
+    name: str,
     webhook: str | None,
-    otherwise: str = "",
+    file: str = "",
+    resumable: bool = False,
 ) -> Row[Any]:
     """Check a complete archive, and add the rows of its capture and of the ingest job.
 
-    The capture has the first name that there is: one that was asked for, its own, or what it is called otherwise.
+    Parameters
+    ----------
+    capture : str
+        The id, under which the parts are stored.
+    key : str, optional
+        The Idempotency-Key.
+    name, file : str
+        The capture has the first name that there is: the one asked for, that in the manifest, or the file's.
+    resumable : bool
+        Whether it was a resumable upload, whose row ends with this.
     """
     context.check_key()
     stored_uploads.seal(context.objects, capture, parts)
-    with stored_uploads.read(context.objects, capture) as file:
-        manifest = CaptureArchive(file, context.settings.limits).manifest
+    with stored_uploads.read(context.objects, capture) as stored:
+        manifest = CaptureArchive(stored, context.settings.limits).manifest
     checkpoint()
 
     def create(c: Connection) -> str:
@@ -196,7 +213,7 @@ def _register(
             c,
             capture,
             job,
-            name=name or manifest.name or otherwise,
+            name=name or manifest.name or file,
             seconds=context.settings.capture_seconds,
             bytes=size,
             frames=len(manifest.frames) or manifest.program.count,
