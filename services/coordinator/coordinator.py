@@ -83,10 +83,11 @@ class Coordinator:
         self._name = f"{socket.gethostname()}:{os.getpid()}"
         self._token: int | None = None
         self._runs: dict[str, JobRun] = {}
-        self._discards: list[tuple[float, Row[Any]]] = []
+        self._removals: list[tuple[float, Row[Any]]] = []
         """Jobs whose files are to be removed: the earliest time, and the job's row."""
-        self._troubles: Counter[str] = Counter()
-        self._full = Outage(logger, quiet=5)
+        self._errors: Counter[str] = Counter()
+        """Unexpected errors while each job was run."""
+        self._database_full = Outage(logger, quiet=5)
         self._beat_at = self._deleted_at = self._swept_at = self._wrote_at = self._read_at = -1e9
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="coordinator")
@@ -95,7 +96,7 @@ class Coordinator:
     def __enter__(self) -> "Coordinator":
         if self._settings.alone:  # and nothing writes to the store yet
             sweep_uploads(self._engine, self._objects)
-            self._tidy_store(self._objects.clock())
+            self._sweep_store(self._objects.clock())
         self._thread.start()
         return self
 
@@ -119,14 +120,14 @@ class Coordinator:
             try:
                 if self._leads():
                     self._step()
-                self._full.is_over("the database has room again")
+                self._database_full.is_over("the database has room again")
             except Superseded as error:
                 logger.warning("%s: %s", self._name, error)
                 self._stand_down()
             except Unavailable:  # logged by `storage.database`
                 self._stopped.wait(1)
             except NoRoom as error:
-                self._full.goes_on("trying again every second: %s", error.detail)
+                self._database_full.goes_on("trying again every second: %s", error.detail)
                 self._stopped.wait(1)
             except Exception:  # nothing may end this thread
                 logger.exception("the coordinator continues after an error")
@@ -154,7 +155,7 @@ class Coordinator:
             kept = self._settings.job_seconds
             self._housekeeping.submit(_logged, delete_old_jobs, self._engine, self._objects, kept)
         if now - self._swept_at > SWEEP:
-            self._tidy_store()
+            self._sweep_store()
         _logged(self._expire)
         return True
 
@@ -165,7 +166,7 @@ class Coordinator:
         for path in expired:
             self._housekeeping.submit(_logged, remove, self._objects, path)
 
-    def _tidy_store(self, before: float | None = None) -> None:
+    def _sweep_store(self, before: float | None = None) -> None:
         """Sweep the store, by default of what is older than the time of grace, and count what is there."""
         self._swept_at = time.monotonic()
         self._housekeeping.submit(_logged, self._sweep, before)
@@ -181,8 +182,8 @@ class Coordinator:
         self._token = None
         for job in list(self._runs):
             self._drop(job)
-        self._discards.clear()
-        self._troubles.clear()
+        self._removals.clear()
+        self._errors.clear()
 
     @contextmanager
     def _writing(self) -> Iterator[Connection]:
@@ -204,7 +205,7 @@ class Coordinator:
                 self._runs[outcome.job].record_outcome(outcome)
         for run in self._due():
             self._guarded(run.job, self._write, run)
-        self._discard()
+        self._remove_due()
         self._submit()
 
     def _read(self) -> None:
@@ -221,7 +222,7 @@ class Coordinator:
             self._guarded(row.id, self._start, row.id)
         # Of other kinds, a newer coordinator knows what is left of them.
         for row in _batch([row for row in cancelled if row.kind in JOB_KINDS]):
-            self._guarded(row.id, self._clean_up, row)
+            self._guarded(row.id, self._undo_cancelled, row)
 
     def _guarded(self, job: str, act: Any, *arguments: Any) -> None:
         """Do something about a job, whose errors must not hold up other jobs."""
@@ -238,12 +239,12 @@ class Coordinator:
                 logger.exception("starting the job again from the ledger")
             if job in self._runs:
                 self._drop(job)
-            self._troubles[job] += 1
-            if self._troubles[job] >= self._settings.attempts:
+            self._errors[job] += 1
+            if self._errors[job] >= self._settings.attempts:
                 self._fail(
                     job,
                     GaveUp(
-                        f"the coordinator failed {self._troubles[job]} times on this job, last with: "
+                        f"the coordinator failed {self._errors[job]} times on this job, last with: "
                         f"{problem_of(error)['detail']}. Retry it, or if that fails too, start a new one"
                     ),
                 )
@@ -291,7 +292,7 @@ class Coordinator:
         run.advance(following)
         if row is not None:
             self._drop(run.job)
-            self._tidy(row)
+            self._remove_useless(row)
 
     def _drop(self, job: str) -> None:
         """Stop running a job, and cancel its tasks on the cluster."""
@@ -307,29 +308,29 @@ class Coordinator:
             jobs.clear_leftovers(c, job)  # of a cancelled job that can't be cleaned up
         if job in self._runs:
             self._drop(job)
-        self._tidy(row)
+        self._remove_useless(row)
 
-    def _tidy(self, row: Row[Any]) -> None:
+    def _remove_useless(self, row: Row[Any]) -> None:
         """Remove what is of no use after the end of a job: its input, or everything if it can't be retried."""
-        self._troubles.pop(row.id, None)  # they are not those of a retry
+        self._errors.pop(row.id, None)  # they are not those of a retry
         if row.state == "succeeded":
             self._housekeeping.submit(_logged, JOB_KINDS[row.kind].remove_inputs, self._objects, row)
             self._housekeeping.submit(_logged, count_bytes, self._engine, self._objects)
         elif row.state == "failed" and JOB_KINDS[row.kind].removes_failed(row.problem):
-            self._discards.append((time.monotonic() + DYING, row))
+            self._removals.append((time.monotonic() + DYING, row))
 
-    def _clean_up(self, row: Row[Any]) -> None:
+    def _undo_cancelled(self, row: Row[Any]) -> None:
         """Remove what a cancelled job wrote, once no worker works on it."""
         with self._writing() as c:
             JOB_KINDS[row.kind].cancelled(c, row)
             jobs.clear_leftovers(c, row.id)
-        self._discards.append((time.monotonic() + DYING, row))
+        self._removals.append((time.monotonic() + DYING, row))
 
-    def _discard(self) -> None:
+    def _remove_due(self) -> None:
         """Remove the files of ended jobs on which no worker works any more."""
         now = time.monotonic()
-        for due in [one for one in list(self._discards) if one[0] <= now]:
-            self._discards.remove(due)
+        for due in [one for one in list(self._removals) if one[0] <= now]:
+            self._removals.remove(due)
             self._housekeeping.submit(self._remove_files, due[1])
 
     def _remove_files(self, row: Row[Any]) -> None:
@@ -344,7 +345,7 @@ class Coordinator:
                 error,
                 exc_info=not isinstance(error, EnvmatteError),
             )
-            self._discards.append((time.monotonic() + AGAIN, row))
+            self._removals.append((time.monotonic() + AGAIN, row))
 
     def _submit(self) -> None:
         """Submit tiles for all free threads, first of the job that has used the fewest worker seconds.
