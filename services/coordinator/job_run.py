@@ -185,30 +185,14 @@ class JobRun:
         """
         again: list[int] = []
         error: EnvmatteError | None = None
-        results = {outcome.tile: outcome.done for outcome in self.outcomes if outcome.done is not None}
-        tiles = [(tile, seconds, pixels) for tile, (seconds, pixels) in results.items() if tile >= 0]
-        steps = [
-            (tile, seconds, 0)
-            for tile, (seconds, result) in results.items()
-            if tile < 0 and "missing" not in result
-        ]
-        tile_records.mark_done(connection, self.job, tiles + steps)
-        if tiles and self.paced != threads:
-            # Not from the first tiles: their workers load what later ones find loaded.
-            self.paced = threads if tile_records.start_pace(connection, self.job, after=threads) else 0
+        results = self._write_results(connection, threads)
         without_store, held = self.without_store and not results, False
         for outcome in self.outcomes:
             if outcome.done is not None:
                 continue
             if isinstance(outcome.error, StoreUnavailable):  # no fault of the tile, so it is no attempt
-                blind = isinstance(outcome.error, WrongStore)  # other workers may see it
-                if blind:
-                    with about(self.job, outcome.tile):
-                        logger.warning("%s", outcome.error.detail)
-                if not (without_store or (blind and self.blind)):
-                    jobs.log(connection, self.job, f"waiting for the store: {outcome.error.detail}")
-                self.blind |= blind
-                held |= not blind
+                self._log_store(connection, outcome.tile, outcome.error, known=without_store)
+                held |= not isinstance(outcome.error, WrongStore)  # other workers may see it
                 without_store = True
                 again.append(outcome.tile)
                 continue
@@ -241,6 +225,31 @@ class JobRun:
         self.to_do.extend(following.to_do)
         self.outcomes.clear()
         self.written_at = time.monotonic()
+
+    def _write_results(self, connection: Connection, threads: int) -> dict[int, tuple[float, Any]]:
+        """Write which tiles and steps are done; returns what they took and gave."""
+        results = {outcome.tile: outcome.done for outcome in self.outcomes if outcome.done is not None}
+        tiles = [(tile, seconds, pixels) for tile, (seconds, pixels) in results.items() if tile >= 0]
+        steps = [
+            (tile, seconds, 0)
+            for tile, (seconds, result) in results.items()
+            if tile < 0 and "missing" not in result
+        ]
+        tile_records.mark_done(connection, self.job, tiles + steps)
+        if tiles and self.paced != threads:
+            # Not from the first tiles: their workers load what later ones find loaded.
+            self.paced = threads if tile_records.start_pace(connection, self.job, after=threads) else 0
+        return results
+
+    def _log_store(self, connection: Connection, tile: int, error: StoreUnavailable, *, known: bool) -> None:
+        """Tell the job's log that a tile could not reach the store, unless it is known."""
+        blind = isinstance(error, WrongStore)
+        if blind:
+            with about(self.job, tile):
+                logger.warning("%s", error.detail)
+        if not (known or (blind and self.blind)):
+            jobs.log(connection, self.job, f"waiting for the store: {error.detail}")
+        self.blind |= blind
 
     def _is_to_repeat(self, connection: Connection, outcome: Outcome, attempts: int) -> bool:
         """Whether a tile without a result is to be done again.
