@@ -1,5 +1,7 @@
-"""Resample images: stretch them over a monitor, and average them over the cells of a grid."""
+"""Resample images: stretch them over a monitor, average them over cells, and shift them by parts of a pixel."""
 
+import math
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -7,6 +9,8 @@ from numpy.typing import NDArray
 
 Value = TypeVar("Value", bound=np.generic)
 
+LANCZOS_LOBES = 3
+"""Lobes on either side of the kernel that images are shifted with."""
 # Values in a strip of a stretched axis.
 _STRIP = 1 << 20
 
@@ -128,3 +132,59 @@ def stretched_mean(
             means.append(area_mean(strip.take(at, axis=axis), *grid))
         values = np.concatenate(means, axis=1 - axis)
     return values
+
+
+def shift_back(
+    values: NDArray[np.float32], shift: Sequence[float], margin: int, *, magnitude: bool = False
+) -> NDArray[np.float32]:
+    """Shift an image back to where it should be.
+
+    Parameters
+    ----------
+    values : (..., h, w, channels) float32
+    shift : (float, float)
+        x and y in pixels: what belongs at (y, x) is at (y + shift[1], x + shift[0]) of the image.
+    margin : int
+        Extra pixels of the image on each side, at least `LANCZOS_LOBES` and the shift, rounded up.
+    magnitude : bool
+        Whether values count by the magnitude of their weights, as where it matters which have a part in a sum.
+
+    Returns
+    -------
+    (..., h - 2 margin, w - 2 margin, channels) float32
+
+    Notes
+    -----
+    The kernel is Lanczos of three lobes, applied along one axis after the other. A value does not depend on the
+    rectangle that it is in.
+    """
+    for axis, distance in ((-2, shift[0]), (-3, shift[1])):
+        whole = math.floor(distance)
+        taps = _lanczos(distance - whole)
+        length = values.shape[axis] - 2 * margin
+        values = _weighed(values, np.abs(taps) if magnitude else taps, axis, margin + whole, length)
+    return values
+
+
+def _lanczos(fraction: float) -> NDArray[np.float32]:
+    """Weights of the neighbours ``1 - LANCZOS_LOBES`` to ``LANCZOS_LOBES`` for a place a part of a pixel away."""
+    distance = np.arange(1 - LANCZOS_LOBES, LANCZOS_LOBES + 1) - fraction
+    taps = np.sinc(distance) * np.sinc(distance / LANCZOS_LOBES)
+    weights: NDArray[np.float32] = (taps / taps.sum()).astype(np.float32)
+    return weights
+
+
+def _weighed(
+    values: NDArray[np.float32], taps: NDArray[np.float32], axis: int, first: int, length: int
+) -> NDArray[np.float32]:
+    """Weighted sums of neighbours along an axis, for ``length`` values from ``first`` on."""
+
+    def neighbours(place: int) -> NDArray[np.float32]:
+        inside = [slice(None)] * values.ndim
+        inside[axis] = slice(place, place + length)
+        return values[tuple(inside)]
+
+    total = np.zeros_like(neighbours(first))
+    for place, tap in enumerate(taps, start=first + 1 - LANCZOS_LOBES):
+        total += tap * neighbours(place)
+    return total

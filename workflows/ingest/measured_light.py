@@ -10,6 +10,7 @@ from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
+from workflows.images.resample import LANCZOS_LOBES, shift_back
 from workflows.images.tone_curves import CameraCurve, Curve, light_of_codes, table, to_light
 from workflows.ingest.local_gain import Surroundings
 from workflows.programs.border import border_light
@@ -19,8 +20,6 @@ from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry, fit_photometry
 from workflows.recovery.normalise import Conditions
 
-LOBES = 3
-"""Lobes on either side of the Lanczos kernel that frames are shifted with."""
 TOUCHED = 0.05
 """A shifted value counts as clipped if clipped values have more than this share of its weights."""
 
@@ -325,7 +324,7 @@ def black_patterns(program: Program) -> NDArray[np.intp]:
 
 def margin_of(shifts: Sequence[Sequence[float]]) -> int:
     """How many pixels around a rectangle are needed to shift frames."""
-    return LOBES + math.ceil(max((abs(s) for shift in shifts for s in shift), default=0))
+    return LANCZOS_LOBES + math.ceil(max((abs(s) for shift in shifts for s in shift), default=0))
 
 
 def unclipped_light(
@@ -350,43 +349,12 @@ def unclipped_light(
     values : (..., h - 2 margin, w - 2 margin, channels) float32
     whole : the same, bool
 
-    Notes
-    -----
-    The kernel is Lanczos of three lobes, applied along one axis after the other. A value does not depend on the
-    rectangle that it is in.
     """
-    values = light_of_codes(codes, look_up)
+    values = shift_back(light_of_codes(codes, look_up), shift, margin)
     clipped = (codes == 0) | (codes >= top)
-    share = clipped.astype(np.float32) if clipped.any() else None
-    for axis, distance in ((-2, shift[0]), (-3, shift[1])):
-        whole = math.floor(distance)
-        taps = _lanczos(distance - whole)
-        values = _weighed(values, taps, axis, margin + whole, values.shape[axis] - 2 * margin)
-        if share is not None:
-            share = _weighed(share, np.abs(taps), axis, margin + whole, share.shape[axis] - 2 * margin)
-    return values, np.ones(values.shape, bool) if share is None else share < TOUCHED
-
-
-def _lanczos(fraction: float) -> Floats:
-    """Weights of the neighbours ``1 - LOBES`` to ``LOBES`` for a position a fraction of a pixel away."""
-    distance = np.arange(1 - LOBES, LOBES + 1) - fraction
-    taps = np.sinc(distance) * np.sinc(distance / LOBES)
-    weights: Floats = (taps / taps.sum()).astype(np.float32)
-    return weights
-
-
-def _weighed(values: Floats, taps: Floats, axis: int, first: int, length: int) -> Floats:
-    """Weighted sums of neighbours along an axis, for ``length`` values from ``first`` on."""
-
-    def neighbours(place: int) -> Floats:
-        inside = [slice(None)] * values.ndim
-        inside[axis] = slice(place, place + length)
-        return values[tuple(inside)]
-
-    total = np.zeros_like(neighbours(first))
-    for place, tap in enumerate(taps, start=first + 1 - LOBES):
-        total += tap * neighbours(place)
-    return total
+    if not clipped.any():
+        return values, np.ones(values.shape, bool)
+    return values, shift_back(clipped.astype(np.float32), shift, margin, magnitude=True) < TOUCHED
 
 
 def _nearest(

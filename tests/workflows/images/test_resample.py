@@ -1,4 +1,4 @@
-"""Images on grids: exact means against a plain integral, and the smallest grid that loses nothing."""
+"""Images on grids: exact means against a plain integral, the smallest grid that loses nothing, and shifts."""
 
 import tracemalloc
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workflows.images.resample import area_mean, smallest_grid, stretch, stretched_mean
+from workflows.images.resample import area_mean, shift_back, smallest_grid, stretch, stretched_mean
 
 
 def test_smallest_grid_loses_no_detail() -> None:
@@ -94,3 +94,19 @@ def test_a_large_monitor_takes_little_memory() -> None:
         tracemalloc.stop()
     assert got.shape == (1000, 1024, 1)
     np.testing.assert_allclose(got.mean(), values.mean(), atol=1e-5)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, 0.0), (-1.3, 2.6)])
+def test_a_picture_that_moved_is_moved_back(shift: tuple[float, float]) -> None:
+    def picture(dx: float, dy: float) -> NDArray[np.float32]:
+        y, x = np.mgrid[:40, :50].astype(np.float32)
+        value = 120 + 60 * np.sin((x - dx) / 2.5) + 50 * np.cos((y - dy) / 3 + (x - dx) / 9)
+        return np.stack([value, value / 2, value], axis=2)
+
+    margin = 6
+    moved = shift_back(picture(*shift), shift, margin)
+    inside = slice(margin, -margin)
+    np.testing.assert_allclose(moved, picture(0, 0)[inside, inside], atol=1)
+    # the same in whatever rectangle
+    part = shift_back(picture(*shift)[5:30, 7:44], shift, margin)
+    np.testing.assert_array_equal(part, moved[5 : 30 - 2 * margin, 7 : 44 - 2 * margin])

@@ -13,7 +13,6 @@ from workflows.ingest.measured_light import (
     PatternLight,
     clipped_from,
     constants_of,
-    margin_of,
     merge,
     stray_light,
     unclipped_light,
@@ -59,23 +58,6 @@ def test_gain_of_a_pattern_is_the_weighted_gain_of_its_frames() -> None:
     _, gain = merge(lambda n: (LOOK_UP[codes[n]], (codes[n] > 0) & (codes[n] < 255)), given, 1, 1)
     assert gain is not None
     np.testing.assert_allclose(gain[0, 0], [0.9, 1.2, 0.9], rtol=1e-6)
-
-
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, 0.0), (-1.3, 2.6)])
-def test_a_picture_that_moved_is_moved_back(shift: tuple[float, float]) -> None:
-    def picture(dx: float, dy: float) -> NDArray[np.uint8]:
-        y, x = np.mgrid[:40, :50].astype(float)
-        value = 120 + 60 * np.sin((x - dx) / 2.5) + 50 * np.cos((y - dy) / 3 + (x - dx) / 9)
-        return np.rint(np.stack([value, value / 2, value], axis=2)).astype(np.uint8)
-
-    margin = margin_of([shift])
-    moved, whole = unclipped_light(picture(*shift), shift, margin, LOOK_UP, 255)
-    inside = slice(margin, -margin)
-    assert whole.all()
-    np.testing.assert_allclose(255 * moved, picture(0, 0)[inside, inside], atol=1.5)
-    # the same in whatever rectangle
-    part, _ = unclipped_light(picture(*shift)[5:30, 7:44], shift, margin, LOOK_UP, 255)
-    np.testing.assert_array_equal(part, moved[5 : 30 - 2 * margin, 7 : 44 - 2 * margin])
 
 
 def test_value_merged_from_clipped_ones_is_clipped() -> None:

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
+from workflows.images.resample import LANCZOS_LOBES
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import (
-    LOBES,
     PatternLight,
     clipped_from,
     conditions_of,
@@ -61,7 +61,7 @@ OUTLIER = 9.0
 
 _SLOPE = 2
 # Pixels that are read around those that are examined.
-_MARGIN = _SLOPE + LOBES + FURTHEST
+_MARGIN = _SLOPE + LANCZOS_LOBES + FURTHEST
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
