@@ -121,9 +121,9 @@ def pack(program: Path, source: Path, output: Path, as_json: bool) -> None:
         stills = stills_in(source, shown)
         if len(stills) < shown.count:
             raise _miscounted(source, len(stills), shown)
-        manifest, files = stills_manifest(shown, stills)
+        manifest, files = packed_stills(shown, stills)
     else:
-        manifest, files = film_manifest(program, source)
+        manifest, files = packed_film(program, source)
     with open_whole(output) as file:
         write_archive(file, {**manifest, "name": source.stem}, files)
     print_output(output, as_json)
@@ -165,7 +165,7 @@ def _miscounted(folder: Path, files: int, program: "Program") -> click.UsageErro
     )
 
 
-def stills_manifest(program: "Program", stills: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Path]]:
+def packed_stills(program: "Program", stills: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Path]]:
     """The capture.json of a program's first stills, and the files of its archive by name."""
     from workflows.programs.files import program_json
 
@@ -183,7 +183,7 @@ def stills_manifest(program: "Program", stills: Sequence[Path]) -> tuple[dict[st
     return manifest, files
 
 
-def film_manifest(program: Path, film: Path) -> tuple[dict[str, Any], dict[str, Path]]:
+def packed_film(program: Path, film: Path) -> tuple[dict[str, Any], dict[str, Path]]:
     """The capture.json of a film of a program, and the files of its archive by name; a usage error if it is of none."""
     entry = f"film{film.suffix}"
     try:

@@ -12,7 +12,7 @@ import click
 
 from services.cli import options
 from services.cli.output import example, print_result
-from services.cli.programs import film_manifest, shown_program, stills_in, stills_manifest, write_archive
+from services.cli.programs import packed_film, packed_stills, shown_program, stills_in, write_archive
 from services.cli.progress import Progress
 from services.cli.remote.jobs import ingest
 from services.client import Capture, Client, Job, JobFailed, ServiceError
@@ -104,7 +104,7 @@ def _stills(folder: Path, program: "Program", name: str) -> Iterator[Taken]:
     stills: Sequence[Path] = ()
     while True:
         stills = _more(folder, len(stills), program)
-        manifest, files = stills_manifest(program, stills)
+        manifest, files = packed_stills(program, stills)
         yield Taken(manifest | {"name": name, "unfinished": True}, files, len(stills) == program.count)
 
 
@@ -130,7 +130,7 @@ def _more(folder: Path, before: int, program: "Program") -> Sequence[Path]:
 
 def _film(file: Path, program: Path, name: str) -> Iterator[Taken]:
     """The film each time that it has grown by some patterns, and once more when it has ended."""
-    manifest, files = film_manifest(program, file)
+    manifest, files = packed_film(program, file)
     manifest |= {"name": name, "unfinished": True}
     pause = FEWEST / manifest["video"]["patterns_per_second"]
     size, grew, taken, due = 0, time.monotonic(), 0, 0.0
