@@ -27,7 +27,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from storage.layout.mattes import Block
-from workflows.mattes.layers import LOBES, MOST_LOBES, trust
+from workflows.mattes.layers import LOBES, MOST_LOBES, confidence_of
 from workflows.mattes.lobes import Gridded, block_lobes
 from workflows.recovery.clusters.lobe_table import FIELDS
 from workflows.recovery.interval import Interval
@@ -122,7 +122,7 @@ def _layer(matte: Source, name: str, *, block_id: tuple[int, ...]) -> NDArray[np
 
 
 def _confidence(matte: Source, *, block_id: tuple[int, ...]) -> NDArray[np.float32]:
-    return trust(matte.chunk("error", *block_id), matte.chunk("recovered", *block_id))
+    return confidence_of(matte.chunk("error", *block_id), matte.chunk("recovered", *block_id))
 
 
 def _lobes(matte: Source, lobes: int, *, block_id: tuple[int, ...]) -> NDArray[np.float32]:

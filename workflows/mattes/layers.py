@@ -80,7 +80,7 @@ def confidence(matte: Matte, rows: slice = slice(None)) -> NDArray[np.float32]:
         ``1 / (1 + e / 0.01)``, e the expected error of a composite in camera units: 1/2 at 40 dB. 0 where nothing was
         recovered.
     """
-    return trust(matte.layer("error", rows), matte.layer("recovered", rows))
+    return confidence_of(matte.layer("error", rows), matte.layer("recovered", rows))
 
 
 def layer(matte: Matte, name: str, rows: slice = slice(None)) -> NDArray[np.float32]:
@@ -190,7 +190,7 @@ def everything(matte: Matte, file: IO[bytes], lobes: int = LOBES) -> None:
                     planes[f"S.{channel}"][at] = block.S[..., c]
                     planes[f"rho.{channel}"][at] = block.rho[..., c]
                 planes["A"][at] = block.recovered
-                planes["confidence.Y"][at] = trust(block.error, block.recovered)
+                planes["confidence.Y"][at] = confidence_of(block.error, block.recovered)
                 for k in range(lobes):
                     for f, name in enumerate(FIELDS):
                         planes[f"lobe{k}.{name}"][at] = ranked[..., k, f]
@@ -209,7 +209,7 @@ def bytes_of_everything(width: int, height: int, lobes: int) -> int:
     return width * height * (11 * 2 + lobes * (2 * 4 + 6 * 2))
 
 
-def trust(error: NDArray[np.float32], recovered: NDArray[np.bool_]) -> NDArray[np.float32]:
+def confidence_of(error: NDArray[np.float32], recovered: NDArray[np.bool_]) -> NDArray[np.float32]:
     """The confidence of pixels from the arrays of a matte."""
     return np.where(recovered, 1 / (1 + error / np.float32(0.01)), np.float32(0))
 
