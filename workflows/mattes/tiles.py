@@ -151,22 +151,25 @@ def recover_block(
     light, recovered = read_light(stack, span, program, gain, wanted)
     crosstalk = np.array(attributes["crosstalk"])
     photometry, measurements, usable, worth = observe(light, attributes, program, monitor)
-    given = (noise, usable, worth)
     places = places_in(span, recovered)
     method, conditions = options.of_method, conditions_of(stack, program)
     patterns = patterns_of(objects, capture)
     if isinstance(method, DgsrOptions):
         # Lobes find the light of a film's border, and fit S and rho to all frames.
-        found = lobes.recover(measurements, photometry, patterns, *given, FAST, conditions, places)
+        found = lobes.recover(
+            measurements, photometry, patterns, noise, usable, worth, FAST, conditions, places
+        )
         photometry = found.photometry
         if found.stray is not None:
             measurements -= found.stray
         sensing, constants = sensing_of(objects, capture), method.constants
-        transport = dgsr.recover(measurements, photometry, sensing, *given, method, conditions)
-        measured = normalise(measurements, photometry, noise, constants.least_contrast, *given[1:])
+        transport = dgsr.recover(measurements, photometry, sensing, noise, usable, worth, method, conditions)
+        measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, worth)
         error, least_weight = dgsr.error_of(transport, photometry, measured, sensing), LEAST_WEIGHT
     else:
-        found = lobes.recover(measurements, photometry, patterns, *given, method, conditions, places)
+        found = lobes.recover(
+            measurements, photometry, patterns, noise, usable, worth, method, conditions, places
+        )
         transport, photometry, error = found.transport, found.photometry, found.error
         least_weight = method.least_weight
     if attributes.get("glare"):
