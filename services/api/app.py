@@ -15,7 +15,7 @@ from services.api.mattes import archives, layers, links, live, mattes
 from services.api.mattes.composites import clips, composites
 from services.api.programs import pattern_files, playback, programs
 from services.api.system import cluster, health, limits, metrics, network, pages, qr_codes
-from services.api.work import Shares
+from services.api.work import RequestShares, Shares
 from services.decoding.pool import Decoders
 from services.runtime import tracing
 from services.settings import Settings
@@ -71,8 +71,10 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         objects,
         Cache(objects, settings.matte_memory),
         Decoders(settings.backdrop_bytes),
-        Shares(settings.request_memory, settings.request_memory // 2, "request_memory"),
-        Shares(BACKDROPS * settings.backdrop_bytes, BACKDROPS // 2 * settings.backdrop_bytes),
+        RequestShares(
+            memory=Shares(settings.request_memory, settings.request_memory // 2, "request_memory"),
+            backdrops=Shares(BACKDROPS * settings.backdrop_bytes, BACKDROPS // 2 * settings.backdrop_bytes),
+        ),
     )
     app.state.checks = health.checks(engine, objects)
     errors.register(app)

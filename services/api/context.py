@@ -17,7 +17,7 @@ from services.api.auth import STRANGER, Caller, bearer, check_method, identify, 
 from services.api.http.browser_security import require_own_site
 from services.api.http.responses import FileStreamResponse
 from services.api.http.shared_reads import SharedReads
-from services.api.work import Shares, run
+from services.api.work import RequestShares, Shares, run
 from services.decoding.pool import Decoders
 from services.settings import Settings
 from storage.database.engine import reading
@@ -25,7 +25,6 @@ from storage.database.owners import for_owner
 from storage.errors import Corrupt, TooMany, Unavailable
 from storage.objects.store import Objects
 from workflows.composite.cache import Cache
-from workflows.threads import CORES
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -46,34 +45,9 @@ class Context:
     """Strips of mattes."""
     decoders: Decoders
     """Processes that decode uploaded pictures."""
-    memory: Shares
-    """Bytes that frames, pixels, layers, composites and archives take while they are read, computed and encoded."""
-    backdrops: Shares
-    """Bytes of backdrops on disk, from their first byte until they are composited."""
-    lists: Shares = field(default_factory=lambda: Shares(4, 1))
-    """Lists, captures and reports made at once: a capture's program may take 60 MB. One an owner, since they compute
-    all the time, and each thread that does delays all other requests."""
-    pictures: Shares = field(default_factory=lambda: Shares(4, 3))
-    """Pictures of programs drawn at once. Like the shares below, it bounds the memory that they take."""
-    films: Shares = field(default_factory=lambda: Shares(2, 1))
-    """Videos of programs encoded at once."""
-    composites: Shares = field(default_factory=lambda: Shares(CORES + 1, CORES))
-    """Composites computed at once: one more than there are cores."""
-    captures: Shares = field(default_factory=lambda: Shares(2, 1))
-    """Capture archives checked at once."""
-    archives: Shares = field(default_factory=lambda: Shares(8, 4))
-    """Archives of mattes sent at once: of each its entries are kept, 10 MB for a matte of 16 megapixels."""
-    imports: Shares = field(default_factory=lambda: Shares(2, 1))
-    """Archives of mattes unpacked at once."""
-    layers: Shares = field(default_factory=lambda: Shares(2, 1))
-    """Layers of mattes, and mattes for browsers, encoded at once."""
-    answers: Shares = field(default_factory=lambda: Shares(4 << 30, 2 << 30))
-    """Bytes of answers in temporary files until they are read. How many one has is known once it is computed: it begins
-    while its owner has less than their share, and may exceed it."""
+    shares: RequestShares
     shared_reads: SharedReads = field(default_factory=SharedReads)
     """Reads what streams of events follow."""
-    calls: Shares = field(default_factory=lambda: Shares(8, 4))
-    """Short calls at once: each takes a thread, and most of them a connection to the database or its write lock."""
     caller: Caller = STRANGER
     check_key: Callable[[], object] = lambda: None
     """Checks again that the caller's key is valid, as `auth.identify` does: for requests that take long."""
@@ -86,7 +60,7 @@ class Context:
         TooMany
             If its turn does not come within ENVMATTE_REQUEST_SECONDS.
         """
-        async with self.calls.take(self.caller.owner, self.settings.request_seconds):
+        async with self.shares.calls.take(self.caller.owner, self.settings.request_seconds):
             return await anyio.to_thread.run_sync(work, *args)
 
     async def compute(
@@ -116,12 +90,12 @@ class Context:
             If too many bytes of the owner's earlier answers have not been read, and as of `services.api.work.run`.
         """
         owner = self.caller.owner
-        needed = [(self.answers, 1), (shares, amount)]
+        needed = [(self.shares.answers, 1), (shares, amount)]
         if memory:
-            needed.append((self.memory, min(memory, self.memory.each)))
+            needed.append((self.shares.memory, min(memory, self.shares.memory.each)))
 
         def begin() -> T:
-            if self.answers.exceeded(owner):  # by answers that began before this one's turn
+            if self.shares.answers.exceeded(owner):  # by answers that began before this one's turn
                 raise TooMany(
                     "earlier answers have not been read yet; read those, or send this request again later"
                 )
@@ -129,7 +103,7 @@ class Context:
 
         result = await run(request, owner, seconds or self.settings.request_seconds, needed, begin)
         if isinstance(result, FileStreamResponse):
-            result.release = self.answers.keep(owner, result.size)
+            result.release = self.shares.answers.keep(owner, result.size)
         return result
 
     @contextmanager

@@ -63,4 +63,4 @@ async def rename(
 
     await context.call(require)
     change = await read_json(request, Change, CHANGE_BYTES)
-    return await context.compute(request, context.lists, make)
+    return await context.compute(request, context.shares.lists, make)

@@ -19,6 +19,7 @@ from services.runtime.memory import return_free
 from services.runtime.problems import TooLarge
 from storage.errors import InvalidInput, TooMany
 from workflows.interruption import interruptible
+from workflows.threads import CORES
 
 T = TypeVar("T")
 CHECK_SECONDS = 0.25
@@ -121,6 +122,38 @@ class Shares:
             self._taken[turn.owner] += turn.amount
             self._turns[turn.owner] = next(self._numbers)
             turn.came.set()
+
+
+@dataclass(frozen=True)
+class RequestShares:
+    """All that requests share while they work, for one app."""
+
+    memory: Shares
+    """Bytes that frames, pixels, layers, composites and archives take while they are read, computed and encoded."""
+    backdrops: Shares
+    """Bytes of backdrops on disk, from their first byte until they are composited."""
+    lists: Shares = field(default_factory=lambda: Shares(4, 1))
+    """Lists, captures and reports made at once: a capture's program may take 60 MB. One an owner, since they compute
+    all the time, and each thread that does delays all other requests."""
+    pictures: Shares = field(default_factory=lambda: Shares(4, 3))
+    """Pictures of programs drawn at once. Like the shares below, it bounds the memory that they take."""
+    films: Shares = field(default_factory=lambda: Shares(2, 1))
+    """Videos of programs encoded at once."""
+    composites: Shares = field(default_factory=lambda: Shares(CORES + 1, CORES))
+    """Composites computed at once: one more than there are cores."""
+    captures: Shares = field(default_factory=lambda: Shares(2, 1))
+    """Capture archives checked at once."""
+    archives: Shares = field(default_factory=lambda: Shares(8, 4))
+    """Archives of mattes sent at once: of each its entries are kept, 10 MB for a matte of 16 megapixels."""
+    imports: Shares = field(default_factory=lambda: Shares(2, 1))
+    """Archives of mattes unpacked at once."""
+    layers: Shares = field(default_factory=lambda: Shares(2, 1))
+    """Layers of mattes, and mattes for browsers, encoded at once."""
+    answers: Shares = field(default_factory=lambda: Shares(4 << 30, 2 << 30))
+    """Bytes of answers in temporary files until they are read. How many one has is known once it is computed: it begins
+    while its owner has less than their share, and may exceed it."""
+    calls: Shares = field(default_factory=lambda: Shares(8, 4))
+    """Short calls at once: each takes a thread, and most of them a connection to the database or its write lock."""
 
 
 async def run(

@@ -103,7 +103,7 @@ async def list_captures(
             rows = page(c, table, limit, after, without=captures.WITHOUT, name=name, state=state)
             return json_response(Captures(captures=[ListedCapture.of(row) for row in rows]))
 
-    return await context.compute(request, context.lists, make)
+    return await context.compute(request, context.shares.lists, make)
 
 
 @router.get("/captures/{id}", response_model=Capture)
@@ -114,7 +114,7 @@ async def get_capture(context: OwnerContext, id: str, request: Request) -> Respo
         with reading(context.engine) as c:
             return capture_response(c, id)
 
-    return await context.compute(request, context.lists, make)
+    return await context.compute(request, context.shares.lists, make)
 
 
 @router.patch("/captures/{id}", response_model=Capture, openapi_extra=CHANGE)
@@ -156,6 +156,6 @@ async def get_frame(context: OwnerContext, id: str, n: int, request: Request) ->
         with context.stored(captures.get, id):
             return bytes_response(encode_png(stack.read(frames=slice(n, n + 1))[0]), "image/png")
 
-    stack, size = await context.compute(request, context.lists, measure)
+    stack, size = await context.compute(request, context.shares.lists, measure)
     # The frame, and a PNG that is as large if the frame is noise.
-    return await context.compute(request, context.memory, encode, max(2 * size, PROGRAM_BYTES))
+    return await context.compute(request, context.shares.memory, encode, max(2 * size, PROGRAM_BYTES))

@@ -80,7 +80,7 @@ async def upload(
     if media_type == JSON:
         given = await read_json(request, FromUpload, FROM_UPLOAD_BYTES)
         create = partial(_from_upload, context, given, idempotency_key)
-        row = await context.compute(request, context.captures, create, memory=CHECK_BYTES)
+        row = await context.compute(request, context.shares.captures, create, memory=CHECK_BYTES)
     elif media_type == ZIP:
         row = await _from_body(context, request, name, idempotency_key, webhook)
     else:
@@ -116,7 +116,7 @@ async def _from_body(
         pieces = reservation.watch(limit.stream(request))
         parts = [await store_as_upload(pieces, context.objects, capture)]
         register = partial(_register, context, capture, parts, key, name=name, webhook=webhook)
-        row = await context.compute(request, context.captures, register, memory=CHECK_BYTES)
+        row = await context.compute(request, context.shares.captures, register, memory=CHECK_BYTES)
     if row.id != capture:  # a concurrent request with the same key was quicker
         await anyio.to_thread.run_sync(remove)
     return row

@@ -25,7 +25,7 @@ async def get_report(context: OwnerContext, id: str, request: Request) -> Respon
         with _stack(context, id) as stack:
             return json_response(report(stack.attributes, stack.frames))
 
-    return await context.compute(request, context.lists, make)
+    return await context.compute(request, context.shares.lists, make)
 
 
 @router.get(
@@ -57,8 +57,8 @@ async def _drawn(context: Context, id: str, request: Request, draw: Callable[[St
         with _stack(context, id) as stack:
             return bytes_response(draw(stack), "image/png")
 
-    memory = await context.compute(request, context.lists, measure)
-    return await context.compute(request, context.pictures, answer, memory=memory)
+    memory = await context.compute(request, context.shares.lists, measure)
+    return await context.compute(request, context.shares.pictures, answer, memory=memory)
 
 
 @contextmanager

@@ -124,7 +124,7 @@ async def post_job(
     """Queue the recovery of a matte; the capture may still be ingesting."""
     # A program may take as long to read as those in lists.
     queue = partial(_queue, context, given, idempotency_key)
-    job = await context.compute(request, context.lists, queue)
+    job = await context.compute(request, context.shares.lists, queue)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
 
@@ -181,7 +181,7 @@ async def list_jobs(
             rows = page(c, table, limit, after, state=state)
             return json_response(Jobs(jobs=list(Job.of(c, rows))))
 
-    return await context.compute(request, context.lists, make)
+    return await context.compute(request, context.shares.lists, make)
 
 
 @router.get("/jobs/{id}")

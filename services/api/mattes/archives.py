@@ -64,9 +64,9 @@ class _Download(Response):
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         context = self._context
-        async with context.archives.take(context.caller.owner, context.settings.request_seconds):
+        async with context.shares.archives.take(context.caller.owner, context.settings.request_seconds):
             # To open it is to make a list of its entries, which ends if nobody waits for the archive any more.
-            archive, title = await context.compute(Request(scope, receive), context.lists, self._open)
+            archive, title = await context.compute(Request(scope, receive), context.shares.lists, self._open)
             headers = {"Content-Length": str(archive.size)} | save_as(self._id, title, ".zip")
             response = StreamingResponse(self._pieces(archive), media_type=ZIP, headers=headers)
             try:
@@ -108,7 +108,7 @@ async def get_entry(context: OwnerContext, id: str, entry: str, request: Request
                 raise NotFound(f"{entry} of matte {id} is empty") from error
             return bytes_response(data, BYTES)
 
-    return await context.compute(request, context.memory, read, ENTRY_BYTES)
+    return await context.compute(request, context.shares.memory, read, ENTRY_BYTES)
 
 
 @router.post(
@@ -147,7 +147,7 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
             part = await store_as_upload(reservation.watch(limit.stream(request)), context.objects, matte)
             row = await context.compute(
                 request,
-                context.imports,
+                context.shares.imports,
                 partial(_import, context, matte, part, name, key),
                 memory=bytes_of_import(context.settings.limits),
                 seconds=context.settings.request_seconds * -(-part.size // ARCHIVE_BYTES),

@@ -193,7 +193,7 @@ async def get_layer(
     if file in NODES:
         band = bytes_of_lookups(matte.width, matte.block, lookups)
         memory = CORES * LOOK_BYTES + (bytes_of_live(matte) if file == live_module.LIVE else band)
-    return await context.compute(request, context.layers, work, memory=memory)
+    return await context.compute(request, context.shares.layers, work, memory=memory)
 
 
 @router.get("/mattes/{id}/transport", response_model=Transport)
@@ -257,7 +257,7 @@ async def _look(
             return answer(look_into(matte, *place, lobes))
 
     matte, size = await context.call(measure)
-    return await context.compute(request, context.memory, look, size)
+    return await context.compute(request, context.shares.memory, look, size)
 
 
 def _describe(pixel: Pixel, cells: int, skip: int) -> dict[str, Any]:

@@ -55,7 +55,7 @@ async def get_live(context: OwnerContext, id: str, request: Request) -> Response
     if etag_matches(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     work = partial(while_there, context, progress, load)
-    return await context.compute(request, context.layers, work, memory=_bytes_of(matte))
+    return await context.compute(request, context.shares.layers, work, memory=_bytes_of(matte))
 
 
 @router.get(
@@ -85,7 +85,7 @@ async def live_page(
         return bytes_response(page, "text/html", headers(title))
 
     row, matte = await context.call(_open, context, id)
-    return await context.compute(request, context.layers, load, memory=_bytes_of(matte))
+    return await context.compute(request, context.shares.layers, load, memory=_bytes_of(matte))
 
 
 def _headers(progress: Progress) -> dict[str, str]:

@@ -93,7 +93,7 @@ async def list_mattes(
             rows = page(c, table, limit, after, name=name, state=state, capture=capture)
             return json_response(Mattes(mattes=[Matte.of(row) for row in rows]))
 
-    return await context.compute(request, context.lists, make)
+    return await context.compute(request, context.shares.lists, make)
 
 
 @router.get("/mattes/{id}")

@@ -44,7 +44,7 @@ async def get_pattern(context: OwnerContext, program: Stored, n: int, request: R
     def draw() -> Response:
         return bytes_response(png(next(pictures(program, n, n + 1))), "image/png")
 
-    return await context.compute(request, context.pictures, draw)
+    return await context.compute(request, context.shares.pictures, draw)
 
 
 @router.get(
@@ -58,7 +58,7 @@ async def get_patterns(context: OwnerContext, program: Stored) -> StreamingRespo
 
     async def stream() -> AsyncIterator[bytes]:
         while True:
-            async with context.pictures.take(context.caller.owner, context.settings.request_seconds):
+            async with context.shares.pictures.take(context.caller.owner, context.settings.request_seconds):
                 part = await anyio.to_thread.run_sync(next, parts, b"")
             if not part:
                 return
@@ -86,7 +86,7 @@ async def get_film(
     def write(file: IO[bytes]) -> None:
         video.encode_video(program, file, rate, progress=lambda done, of: checkpoint())
 
-    return await context.compute(request, context.films, lambda: file_response(write, "video/mp4"))
+    return await context.compute(request, context.shares.films, lambda: file_response(write, "video/mp4"))
 
 
 @page.get(

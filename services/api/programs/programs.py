@@ -204,7 +204,7 @@ async def list_programs(
             rows = page(c, table, limit, after)
             return json_response(Programs(programs=[ListedProgram.of(row) for row in rows]))
 
-    return await context.compute(request, context.lists, make)
+    return await context.compute(request, context.shares.lists, make)
 
 
 @router.get("/programs/{id}")

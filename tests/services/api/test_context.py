@@ -17,7 +17,7 @@ from fastapi.testclient import TestClient
 from services.api.app import build_app
 from services.api.auth import Caller, identify
 from services.api.context import KEY_CHECK, Context
-from services.api.work import Shares
+from services.api.work import RequestShares, Shares
 from services.decoding.pool import Decoders
 from services.runtime.problems import Unauthorized
 from services.settings import Settings
@@ -37,9 +37,9 @@ def test_download_ends_when_its_key_is_revoked(tmp_path: Path) -> None:
     settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
     check_key = partial(identify, settings, engine, key)
     decoders = Decoders(settings.backdrop_bytes)  # no process starts before the first picture
-    shares = Shares(1, 1)
+    shares = RequestShares(memory=Shares(1, 1), backdrops=Shares(1, 1))
     cache = Cache(objects, 0)
-    context = Context(settings, engine, objects, cache, decoders, shares, shares, check_key=check_key)
+    context = Context(settings, engine, objects, cache, decoders, shares, check_key=check_key)
 
     def pieces() -> Iterator[bytes]:
         for n in range(5):
@@ -60,9 +60,10 @@ def test_download_ends_when_its_key_is_revoked(tmp_path: Path) -> None:
 def context(tmp_path: Path) -> Iterator[Context]:
     engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
     settings, objects = Settings(data=tmp_path), Objects((tmp_path / "store").as_uri())
-    cache, memory = Cache(objects, 0), Shares(8, 4, "request_memory")
+    cache = Cache(objects, 0)
+    shares = RequestShares(memory=Shares(8, 4, "request_memory"), backdrops=Shares(1, 1))
     decoders = Decoders(settings.backdrop_bytes)
-    yield Context(settings, engine, objects, cache, decoders, memory, Shares(1, 1))
+    yield Context(settings, engine, objects, cache, decoders, shares)
     engine.dispose()
 
 
@@ -132,7 +133,7 @@ def test_archives_are_checked_once_there_is_memory(tmp_path: Path, route: str) -
     engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
     settings = Settings(data=tmp_path, request_seconds=1)
     app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
-    memory = app.state.context.memory
+    memory = app.state.context.shares.memory
     with TestClient(app, "http://127.0.0.1", headers={"Content-Type": "application/zip"}) as client:
         assert client.portal is not None
         with ExitStack() as taken:
@@ -150,7 +151,7 @@ def test_archives_are_sent_in_turn(tmp_path: Path) -> None:
     engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
     settings = Settings(data=tmp_path, request_seconds=1)
     app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
-    archives, sent = app.state.context.archives, archive(tmp_path / "made", 8, 8)
+    archives, sent = app.state.context.shares.archives, archive(tmp_path / "made", 8, 8)
     with TestClient(app, "http://127.0.0.1", headers={"Content-Type": "application/zip"}) as client:
         assert client.portal is not None
         matte = client.post("/v1/mattes", content=sent).json()["id"]

@@ -105,7 +105,7 @@ async def post_composite(
     progress = await context.call(progress_of, context, id)
     limit = context.settings.backdrop_bytes
     announced = BodyLimit(limit).check_announced(request) or limit
-    turn = context.backdrops.take(context.caller.owner, context.settings.request_seconds, announced)
+    turn = context.shares.backdrops.take(context.caller.owner, context.settings.request_seconds, announced)
     async with turn, spool_body(request, limit) as body:
         asked = CompositeRequest(context, params, media_type)
 
@@ -113,7 +113,7 @@ async def post_composite(
             return while_there(context, progress, lambda now: asked.answer(now, body, request.headers))
 
         memory = await context.call(asked.most_bytes, progress)
-        return await context.compute(request, context.composites, answer, memory=memory)
+        return await context.compute(request, context.shares.composites, answer, memory=memory)
 
 
 @dataclass(frozen=True)

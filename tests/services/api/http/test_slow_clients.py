@@ -134,7 +134,7 @@ def test_answers_that_nobody_takes_keep_their_owner_waiting(
 ) -> None:
     path = f"/v1/mattes/{served.matte}/layers/S.exr"
     size = len(served.ask(path).content)
-    monkeypatch.setattr(served.app.state.context.answers, "each", 3 * size // 2)
+    monkeypatch.setattr(served.app.state.context.shares.answers, "each", 3 * size // 2)
     monkeypatch.setattr(slow_clients, "CHECK_SECONDS", 30.0)
     with contextlib.ExitStack() as stack, served.connected(b"") as last:
         connections = [stack.enter_context(served.connected(get(path))) for _ in range(6)]
