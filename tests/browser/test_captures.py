@@ -294,3 +294,22 @@ def test_frames_are_browsed_by_keys(desk: Page, service: Service, ready: tuple[s
         if frame:
             expect(desk.get_by_text(f"{frame} of {frames}")).to_be_visible()
             expect(desk.get_by_alt_text(f"Frame {frame}", exact=True)).to_be_visible()
+
+
+def test_pictures_of_a_capture_are_fetched_again_after_an_outage(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    desk.clock.install()
+    desk.route("**/*.png", lambda route: route.abort("connectionreset"))
+    desk.goto(f"{service.url}/#/captures/{ready[0]}")
+    pictures = desk.locator("main .picture > img")
+    expect(pictures).to_have_count(2)
+    for _ in range(2):  # each is asked for twice
+        desk.clock.run_for(500)
+        desk.wait_for_timeout(100)
+    expect(desk.get_by_role("alert")).to_have_count(2)
+    desk.unroute("**/*.png")
+    desk.clock.run_for(5000)
+    for picture in pictures.all():
+        expect(picture).to_be_visible()
+    expect(desk.get_by_role("alert")).to_have_count(0)

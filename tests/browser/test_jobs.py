@@ -182,6 +182,20 @@ def test_recovery_follows_the_ingest_by_itself(desk: Page, service: Service, bal
     )
 
 
+@pytest.mark.parametrize("lost", ["captures/*/report", "jobs"])
+def test_recovery_follows_the_ingest_after_an_outage(
+    desk: Page, service: Service, ball: Path, lost: str
+) -> None:
+    desk.route(f"**/v1/{lost}", lambda route: route.abort("connectionreset"))
+    with paused(service):
+        capture = service.client.upload(ball)
+        desk.goto(f"{service.url}/#/captures/{capture['id']}")
+        desk.get_by_role("radio", name="Draft").check()
+    expect(desk.get_by_role("alert")).to_contain_text("The service does not answer", timeout=MINUTE)
+    desk.unroute(f"**/v1/{lost}")
+    expect(desk).to_have_url(re.compile("#/mattes/"), timeout=2 * MINUTE)
+
+
 def test_activity_lists_the_last_jobs(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     with paused(service):
         job = service.client.recover(ready[0])["id"]

@@ -1,6 +1,6 @@
 // What several views have in common: steps, deletion, names, qualities, thumbnails.
 import { RETRY, remove } from "./api.js";
-import { button, confirmed, h, newest, pause, show } from "./dom.js";
+import { button, confirmed, h, newest, pause, problemBox, show } from "./dom.js";
 import { t } from "./words.js";
 
 const STEPS = ["film", "check", "recover", "play"];
@@ -20,6 +20,22 @@ export function staying() {
 
 // Shows the view that is open once more: what it shows has changed.
 export const showAgain = () => dispatchEvent(new HashChangeEvent("hashchange"));
+
+// Does what needs the service, and does it again after an outage. An error is shown in `where`.
+export async function persist(work, where, signal) {
+	while (!signal.aborted) {
+		try {
+			await work();
+			return where.replaceChildren();
+		} catch (error) {
+			const box = problemBox(error);
+			// Otherwise a screen reader would read it again each time.
+			if (box.textContent !== where.textContent) where.replaceChildren(box);
+			if (!error.isTemporary) return;
+			await pause(RETRY, signal).catch(() => {}); // the user left the view
+		}
+	}
+}
 
 // A button that deletes what a path such as `v1/captures/ID` names; then its list is shown.
 export function deletion(path, where, lost) {

@@ -3,7 +3,7 @@ import { getBlob, getJson, patchJson } from "../lib/api.js";
 import { badge, bytes, facts, h, newest, problemBox, prose, sentence, show, size, when } from "../lib/dom.js";
 import { followJob } from "../lib/job_progress.js";
 import { renamable } from "../lib/rename.js";
-import { CHECK, deletion, showAgain, steps } from "../lib/view.js";
+import { CHECK, deletion, persist, showAgain, steps } from "../lib/view.js";
 import { matteCards } from "./mattes.js";
 import { recoveryForm } from "./recovery_form.js";
 import { verdictOf } from "./report.js";
@@ -37,10 +37,10 @@ export async function capture(main, signal, id) {
 	const panel = h("section.panel", h("h2", t("capture.reading")));
 	const { form, isAutomatic, start } = await recoveryForm(found, signal);
 	main.append(panel, form);
-	followJob(panel, found.job, signal).then(async ({ state }) => {
+	followJob(panel, found.job, signal).then(({ state }) => persist(async () => {
 		if (state === "succeeded" && isAutomatic() && (await getJson(`v1/captures/${id}/report`, signal)).level !== "bad") return start();
 		showAgain(); // it is ready, or has failed
-	}).catch((error) => signal.aborted || panel.append(problemBox(error)));
+	}, problem, signal)).catch((error) => signal.aborted || problem.replaceChildren(problemBox(error)));
 }
 
 async function mattesOf(id, signal) {
@@ -69,15 +69,11 @@ function frames(found, signal) {
 	const number = h("input", { type: "range", id: "frame", min: 0, max: found.frames - 1, value: middle });
 	const position = h("output", { for: "frame" }, t("of", { n: middle + 1, all: found.frames }));
 	const problem = h("div");
-	const look = newest(async () => {
-		try {
-			await show(image, await getBlob(`v1/captures/${found.id}/frames/${number.value}.png`, signal));
-			image.alt = t("frame.n", { n: Number(number.value) + 1 });
-			problem.replaceChildren();
-		} catch (error) {
-			if (!signal.aborted) problem.replaceChildren(problemBox(error));
-		}
-	});
+	const look = newest(() => persist(async () => {
+		const n = Number(number.value);
+		await show(image, await getBlob(`v1/captures/${found.id}/frames/${n}.png`, signal));
+		image.alt = t("frame.n", { n: n + 1 });
+	}, problem, signal));
 	number.oninput = () => {
 		position.textContent = t("of", { n: Number(number.value) + 1, all: found.frames });
 		look();
@@ -91,10 +87,11 @@ function sheet(found, signal) {
 	const image = h("img", { alt: t("sheet.alt"), hidden: true });
 	const frame = h("div.picture.whole", image);
 	frame.style.aspectRatio = `${2 * found.width} / ${1.1 * found.height}`; // most sheets are four by two frames: this keeps the page from moving when it loads
-	const fit = (blob) => show(image, blob).then(() => (frame.style.aspectRatio = `${image.naturalWidth} / ${image.naturalHeight}`));
-	getBlob(`v1/captures/${found.id}/contact-sheet.png`, signal).then(fit, (error) => {
-		if (!signal.aborted) image.replaceWith(problemBox(error));
-	});
-	return h("section.panel", h("h2", t("sheet")), frame,
+	const problem = h("div");
+	persist(async () => {
+		await show(image, await getBlob(`v1/captures/${found.id}/contact-sheet.png`, signal));
+		frame.style.aspectRatio = `${image.naturalWidth} / ${image.naturalHeight}`;
+	}, problem, signal);
+	return h("section.panel", h("h2", t("sheet")), frame, problem,
 		h("p.hint", t("sheet.clipped")));
 }

@@ -84,6 +84,7 @@ export async function recoveryForm(capture, signal) {
 			if (once) automatic.add(job.id);
 			if (isHere()) location.hash = `#/jobs/${job.id}`;
 		} catch (error) {
+			if (once && error.isTemporary) throw error; // its caller starts it again
 			problem.replaceChildren(problemBox(error));
 			const wrong = fields.find(({ option, input }) => option.name === error.field && !input.disabled)?.input;
 			wrong?.setAttribute("aria-invalid", "true");
