@@ -50,6 +50,7 @@ async function route(navigated) {
 	// What follows a question mark is the view's own.
 	const [, hash, name = "home", id] = /^(#\/(?:(\w+)(?:\/([\w-]+))?)?)(?:\?.*)?$/.exec(location.hash) ?? [];
 	if (hash === undefined || !VIEWS[name]?.[id ? 1 : 0]) return location.replace("#/");
+	for (const dialog of document.querySelectorAll("dialog[open]:not(#unlock)")) dialog.close(); // it was about the view before
 	const before = views.get(hash);
 	const view = (shown = recordings.has(before?.signal) ? before : open(hash));
 	tidy();
