@@ -63,22 +63,23 @@ function verdict(report) {
 
 function frames(found, signal) {
 	const middle = found.frames >> 1; // the first ones are black and white
-	const image = h("img", { alt: t("frame.n", { n: middle + 1 }), width: found.width, height: found.height, hidden: true });
+	const image = h("img", { alt: t("frame.n", { n: middle }), width: found.width, height: found.height, hidden: true });
 	const frame = h("div.picture", image);
 	frame.style.aspectRatio = `${found.width} / ${found.height}`; // keeps its place until the picture is there
-	const number = h("input", { type: "range", id: "frame", min: 0, max: found.frames - 1, value: middle });
-	const position = h("output", { for: "frame" }, t("of", { n: middle + 1, all: found.frames }));
+	const last = found.frames - 1; // they count from 0, as in the report, the API and names of files
+	const number = h("input", { type: "range", id: "frame", min: 0, max: last, value: middle });
+	const position = h("output", { for: "frame" });
 	const problem = h("div");
 	const look = newest(() => persist(async () => {
-		const n = Number(number.value);
+		const n = number.value;
 		await show(image, await getBlob(`v1/captures/${found.id}/frames/${n}.png`, signal));
-		image.alt = t("frame.n", { n: n + 1 });
+		image.alt = t("frame.n", { n });
 	}, problem, signal));
 	number.oninput = () => {
-		position.textContent = t("of", { n: Number(number.value) + 1, all: found.frames });
+		position.textContent = t("frame.of", { n: number.value, last });
 		look();
 	};
-	look();
+	number.oninput();
 	return h("section.panel", h("h2", t("frames")), frame,
 		h("div.row", h("label", { for: "frame" }, t("frame")), number, position), problem);
 }

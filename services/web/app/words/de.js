@@ -118,6 +118,7 @@ export const de = {
 	"filming": "Filmen",
 	"frame": "Bild",
 	"frame.n": "Bild {n}",
+	"frame.of": "{n} (0 bis {last})",
 	"frames": "Bilder",
 	"frames.n": "{n} Bilder",
 	"full": "Vollbild",

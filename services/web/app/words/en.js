@@ -118,6 +118,7 @@ export const en = {
 	"filming": "Filming",
 	"frame": "Frame",
 	"frame.n": "Frame {n}",
+	"frame.of": "{n} (0 to {last})",
 	"frames": "Frames",
 	"frames.n": "{n} frames",
 	"full": "Full screen",
