@@ -19,6 +19,8 @@ from workflows.programs.preset_names import PRESETS
 if TYPE_CHECKING:
     from workflows.programs.program import Program
 
+LAST = 9999
+"""Number that cameras give a still before they count from 0 or 1 again."""
 OTHER_VIDEOS = {".webm", ".mov", ".avi", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".wmv", ".ogv", ".gif"}
 """Ends of names of videos that are not written: a folder of such a name is not what was meant."""
 
@@ -114,13 +116,16 @@ def pack(program: Path, source: Path, output: Path, as_json: bool) -> None:
     """Pack what a camera took of PROGRAM into an archive for `envmatte upload`.
 
     For a FILM, PROGRAM is the .json beside the video of the patterns. For a folder of STILLS it is the program.json
-    beside the pictures; there is one still of each, the first by name that of the first pattern.
+    beside the pictures; there is one still of each, the first by name that of the first pattern. Where the camera's
+    numbers began again after 9999, the stills from there on are the last.
     """
     if source.is_dir():
         shown = shown_program(program)
         stills = stills_in(source, shown)
         if len(stills) < shown.count:
             raise _miscounted(source, len(stills), shown)
+        if note := rollover(stills):
+            click.echo(note, err=True)
         manifest, files = packed_stills(shown, stills)
     else:
         manifest, files = packed_film(program, source)
@@ -141,7 +146,8 @@ def shown_program(file: Path) -> "Program":
 
 
 def stills_in(folder: Path, program: "Program") -> Sequence[Path]:
-    """The stills in a folder, by name; a usage error if they are of several kinds, or more than the patterns."""
+    """The stills in a folder, in the order of their names but for a `rollover`; a usage error if they are of several
+    kinds, or more than the patterns."""
     stills = [path for path in sorted(folder.glob("[!.]*"), key=_by_number) if path.is_file()]
     kinds = sorted({path.suffix.lower() for path in stills})
     if len(kinds) > 1:
@@ -150,7 +156,27 @@ def stills_in(folder: Path, program: "Program") -> Sequence[Path]:
         )
     if len(stills) > program.count:
         raise _miscounted(folder, len(stills), program)
-    return stills
+    return _in_order(stills)
+
+
+def rollover(stills: Sequence[Path]) -> str | None:
+    """A note on stills, as `stills_in` has them, of which the last have the first names."""
+    ordered = sorted(stills, key=_by_number)
+    if list(stills) == ordered:
+        return None
+    return f"the camera's numbers began again: {ordered[0].name} is taken as the one after {ordered[-1].name}"
+
+
+def _in_order(stills: list[Path]) -> list[Path]:
+    """Puts what comes after a wide gap in the numbers first, unless the times of the files say otherwise.
+
+    The web app does the same.
+    """
+    numbers = [int([0, *re.findall("[0-9]+", path.stem)][-1]) for path in stills]
+    gaps = [n for n in range(1, len(stills)) if numbers[n] - numbers[n - 1] > LAST / 2]
+    if not gaps or numbers[-1] > LAST or stills[-1].stat().st_mtime > stills[0].stat().st_mtime:
+        return stills
+    return stills[gaps[0] :] + stills[: gaps[0]]
 
 
 def _by_number(path: Path) -> tuple[list[tuple[int, str]], str]:

@@ -12,7 +12,14 @@ import click
 
 from services.cli import options
 from services.cli.output import example, print_result
-from services.cli.programs import packed_film, packed_stills, shown_program, stills_in, write_archive
+from services.cli.programs import (
+    packed_film,
+    packed_stills,
+    rollover,
+    shown_program,
+    stills_in,
+    write_archive,
+)
 from services.cli.progress import Progress
 from services.cli.remote.jobs import ingest
 from services.client import Capture, Client, Job, JobFailed, ServiceError
@@ -102,8 +109,13 @@ def tether(
 def _stills(folder: Path, program: "Program", name: str) -> Iterator[Taken]:
     """All stills in the folder, each time that there are more of them."""
     stills: Sequence[Path] = ()
+    noted = None
     while True:
         stills = _more(folder, len(stills), program)
+        note = rollover(stills)
+        if note and not noted:
+            click.echo(note, err=True)
+        noted = noted or note
         manifest, files = packed_stills(program, stills)
         yield Taken(manifest | {"name": name, "unfinished": True}, files, len(stills) == program.count)
 
