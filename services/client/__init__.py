@@ -36,13 +36,12 @@ from services.client._errors import (
     Busy,
     FileChanged,
     InvalidKey,
-    JobFailed,
     NotAllowed,
     NotFound,
     ServiceError,
     Unreachable,
 )
-from services.client._records import Capture, Job, Layers, Matte
+from services.client._records import Capture, Job, JobFailed, Layers, Matte
 
 __all__ = [
     "Busy",

@@ -8,9 +8,9 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
 
 from services.client import _download
-from services.client._errors import JobFailed, NotFound
+from services.client._errors import NotFound, foreign
 from services.client._paths import id_of, path_of
-from services.client._records import Capture, Job, Layers, Matte, Record
+from services.client._records import Capture, Job, JobFailed, Layers, Matte, Record
 
 if TYPE_CHECKING:
     from services.client._arrays import Floats
@@ -192,7 +192,9 @@ class Client:
         """The answers of all pages of a collection."""
         query = {**wanted, "limit": str(_PAGE)}
         while True:
-            (page,) = self._http.json("GET", kind.path, params=query).values()
+            page = self._http.json("GET", kind.path, params=query).get(kind.path.rpartition("/")[2])
+            if not isinstance(page, list):
+                raise foreign()
             yield from page
             if len(page) < _PAGE:
                 return
@@ -270,6 +272,7 @@ class Client:
             f"{path_of(Matte, matte)}/composite",
             safe=True,
             computing=True,
+            file=True,
             params=wanted,
             content=backdrop,
             headers={"Accept": kind},
@@ -305,7 +308,8 @@ class Client:
         over, in place of a picture that is stretched over the monitor.
         """
         path, params = f"{path_of(Matte, matte)}/layers/{name}", {"plate": "true"} if plate else {}
-        return self._http.send("GET", path, params=params, computing=True).content
+        file = not name.endswith(".html")
+        return self._http.send("GET", path, params=params, computing=True, file=file).content
 
     def live_page(self, matte: Matte | str) -> bytes:
         """Get a matte as a web page in one file, which draws the glass without a service."""
@@ -322,6 +326,8 @@ class Client:
             Until the link expires, 3650 at most.
         """
         made = self._http.json("POST", f"{path_of(Matte, matte)}/links", json={"days": days})
+        if "path" not in made:
+            raise foreign()
         return self._http.url_of(made["path"])
 
     def export(

@@ -20,7 +20,7 @@ def by_ranges(http: "Session", path: str, target: BinaryIO) -> None:
     at, size = 0, 1
     while at < size:
         asked = {"Range": f"bytes={at}-{at + RANGE - 1}"}
-        answer = http.send("GET", path, headers=asked)
+        answer = http.send("GET", path, headers=asked, file=True)
         at += target.write(answer.content)
         size = int(answer.headers.get("Content-Range", f"/{at}").rpartition("/")[2])
 
@@ -37,7 +37,7 @@ def whole(http: "Session", path: str, file: Path, progress: Callable[[int, int],
         may_restart = stat.S_ISREG(os.fstat(out.fileno()).st_mode) and not is_standard_output(file)
 
         def get() -> None:
-            with http.streamed("GET", path) as answer:
+            with http.streamed("GET", path, file=True) as answer:
                 size, done = int(http.header(answer, "Content-Length")), 0
                 if may_restart:
                     out.seek(0)

@@ -1,9 +1,6 @@
 """Errors of the client; `services.client` draws the tree."""
 
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from services.client._records import Job
+from typing import Any
 
 
 class ServiceError(Exception):
@@ -51,13 +48,10 @@ class FileChanged(ServiceError):
         super().__init__({"title": "The file has changed", "status": 400, "detail": detail})
 
 
-class JobFailed(ServiceError):
-    """A job failed or was cancelled: ``job``."""
-
-    def __init__(self, job: "Job") -> None:
-        detail = f"job {job.id} was cancelled"
-        super().__init__(job.problem or {"title": "Cancelled", "status": 409, "detail": detail})
-        self.job = job
+def foreign(server: object = "the server") -> ServiceError:
+    """The error for an answer that is not that of a service."""
+    detail = f"{server} does not answer like an envmatte service; check the URL"
+    return ServiceError({"title": "Another service", "status": 502, "detail": detail})
 
 
 OF_STATUS: dict[int, type[ServiceError]] = {

@@ -1,8 +1,10 @@
-"""Records that the service returns: captures, jobs and mattes."""
+"""Records that the service returns: captures, jobs and mattes; and the error of a job."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+from services.client._errors import ServiceError, foreign
 
 if TYPE_CHECKING:
     from services.client._arrays import Floats
@@ -33,11 +35,14 @@ class Record:
 
         A field that an older service lacks has its default.
         """
-        known = {
-            f.name: answer[f.name]
-            for f in fields(cls)
-            if f.name not in ("answer", *more) and (f.name in answer or f.default is MISSING)
-        }
+        try:
+            known = {
+                f.name: answer[f.name]
+                for f in fields(cls)
+                if f.name not in ("answer", *more) and (f.name in answer or f.default is MISSING)
+            }
+        except (KeyError, TypeError) as error:
+            raise foreign() from error
         return cls(answer=answer, **known, **more)
 
     def __getitem__(self, name: str) -> Any:
@@ -88,6 +93,15 @@ class Job(Record):
     def ended(self) -> bool:
         """Whether it has ended, in success or not."""
         return self.state in ("succeeded", "failed", "cancelled")
+
+
+class JobFailed(ServiceError):
+    """A job failed or was cancelled: ``job``."""
+
+    def __init__(self, job: Job) -> None:
+        detail = f"job {job.id} was cancelled"
+        super().__init__(job.problem or {"title": "Cancelled", "status": 409, "detail": detail})
+        self.job = job
 
 
 class Layers(Mapping[str, "Floats"]):

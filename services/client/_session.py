@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import httpx2
 
-from services.client._errors import OF_STATUS, Busy, InvalidKey, ServiceError, Unreachable
+from services.client._errors import OF_STATUS, Busy, InvalidKey, ServiceError, Unreachable, foreign
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ class Session:
         answer = self.send(method, path, safe=safe, **request)
         found = _object(answer)
         if found is None:
-            raise self._foreign()
+            raise foreign(self._http.base_url)
         return found
 
     def send(self, method: str, path: str, *, safe: bool = False, **request: Any) -> httpx2.Response:
@@ -100,7 +100,7 @@ class Session:
         safe : bool
             Whether it may be repeated although neither its method nor an Idempotency-Key says so.
         **request
-            As for `once`.
+            As for `streamed`.
         """
         safe = safe or method in SAFE or "Idempotency-Key" in (request.get("headers") or {})
         return self.patiently(lambda: self.once(method, path, **request), safe=safe)
@@ -125,10 +125,24 @@ class Session:
             time.sleep(wait)
             pause = min(2 * pause, LONGEST_PAUSE)
 
-    def once(
-        self, method: str, path: str, *, content: Body | None = None, computing: bool = False, **request: Any
-    ) -> httpx2.Response:
-        """Send a request once.
+    def once(self, method: str, path: str, **request: Any) -> httpx2.Response:
+        """Send a request once, as `streamed` does, and read the answer."""
+        with self.streamed(method, path, **request) as answer:
+            answer.read()
+        return answer
+
+    @contextmanager
+    def streamed(
+        self,
+        method: str,
+        path: str,
+        *,
+        content: Body | None = None,
+        computing: bool = False,
+        file: bool = False,
+        **request: Any,
+    ) -> Iterator[httpx2.Response]:
+        """An answer whose body has not been read yet; the body of an error has been.
 
         Parameters
         ----------
@@ -136,18 +150,11 @@ class Session:
             The body, or a function that returns its parts, so that they can be sent again.
         computing : bool
             Whether the service computes before its first byte.
+        file : bool
+            Whether the answer is a file, and neither a web page nor JSON, which are those of another server.
         **request
             As httpx takes them: ``params``, ``headers``, ``json``.
         """
-        with self.streamed(method, path, content=content, computing=computing, **request) as answer:
-            answer.read()
-        return answer
-
-    @contextmanager
-    def streamed(
-        self, method: str, path: str, *, content: Body | None = None, computing: bool = False, **request: Any
-    ) -> Iterator[httpx2.Response]:
-        """An answer whose body has not been read yet; the body of an error has been."""
         if computing:
             request["timeout"] = httpx2.Timeout(SILENCE, read=COMPUTING)
         if content is not None:
@@ -157,6 +164,9 @@ class Session:
                 if not answer.is_success:
                     answer.read()
                     raise _refusal(method, answer)
+                media_type = answer.headers.get("content-type", "").partition(";")[0]
+                if file and media_type in ("text/html", "application/json"):
+                    raise foreign(self._http.base_url)
                 yield answer
                 self.answered = True
         except httpx2.TransportError as error:
@@ -168,12 +178,8 @@ class Session:
     def header(self, answer: httpx2.Response, name: str) -> str:
         """A header that an answer must have."""
         if name not in answer.headers:
-            raise self._foreign()
+            raise foreign(self._http.base_url)
         return str(answer.headers[name])
-
-    def _foreign(self) -> ServiceError:
-        detail = f"{self._http.base_url} does not answer like an envmatte service; check the URL"
-        return ServiceError({"title": "Another service", "status": 502, "detail": detail})
 
 
 def _object(answer: httpx2.Response) -> dict[str, Any] | None:

@@ -1,16 +1,19 @@
 """Requests of the client: which failures are retried, and how long it waits."""
 
+import io
+import json
 import threading
 import time
 from collections.abc import Callable
 from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler
+from pathlib import Path
 
 import pytest
 
 from services.client import Busy, Client, ServiceError, Unreachable
 from services.client._session import FIRST_PAUSE, LONGEST_PAUSE
-from tests.services.client.servers import Answer, ok, refusal, scripted_server, web_server
+from tests.services.client.servers import JOB, Answer, ok, refusal, scripted_server, web_server
 
 
 def test_unreachable_service_is_named() -> None:
@@ -90,7 +93,8 @@ CALLS: dict[str, Callable[[Client], object]] = {
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
 def test_safe_request_is_retried_with_the_same_key(call: Callable[[Client], object]) -> None:
     failures = {1: None, 2: refusal(503), 3: refusal(502)}
-    with scripted_server(lambda n: failures.get(n, ok())) as (url, calls), Client(url) as client:
+    answer = 200, {}, json.dumps(JOB).encode()  # a file or a job
+    with scripted_server(lambda n: failures.get(n, answer)) as (url, calls), Client(url) as client:
         client.job("j")  # a service that has answered once is retried
         call(client)
     assert len(calls) == 5
@@ -153,13 +157,34 @@ def test_long_retry_after_is_an_error_at_once() -> None:
     assert (len(calls), caught.value.retry_after, caught.value.status) == (1, 3600, 429)
 
 
-def test_another_web_server_is_recognised() -> None:
+@pytest.mark.parametrize(
+    ("kind", "body"),
+    [("text/html", b"<html>"), ("application/json", b'{"id": 1}'), ("application/json", b"[]")],
+)
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda client, _: client.job("j"),
+        lambda client, _: list(client.captures()),
+        lambda client, _: list(client.mattes()),
+        lambda client, _: client.share("m"),
+        lambda client, _: client.composite("m", b"backdrop"),
+        lambda client, _: client.layer("m", "alpha.png"),
+        lambda client, file: client.export("m", file),
+        lambda client, file: client.video("j", io.BytesIO()),
+    ],
+)
+def test_another_web_server_is_recognised(
+    call: Callable[[Client, Path], object], kind: str, body: bytes, tmp_path: Path
+) -> None:
+    file = tmp_path / "made.zip"
     with (
-        scripted_server(lambda n: (200, {"Content-Type": "text/html"}, b"<html>")) as (url, _),
+        scripted_server(lambda n: (200, {"Content-Type": kind}, body)) as (url, _),
         Client(url) as client,
         pytest.raises(ServiceError, match="does not answer like an envmatte service"),
     ):
-        client.job("j")
+        call(client, file)
+    assert not file.exists()
 
 
 def test_redirect_says_where_it_leads() -> None:
