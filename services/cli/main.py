@@ -34,6 +34,8 @@ class _Main(click.Group):
         except EnvmatteError as error:
             kind = _PortTaken if isinstance(error, PortTaken) else click.ClickException
             raise kind(error.detail) from error
+        except UnicodeEncodeError as error:
+            raise click.UsageError(f"{error.object!r} has bytes that are not UTF-8") from error
         except ValueError as error:
             from pydantic import ValidationError
 

@@ -27,7 +27,8 @@ def bind(host: str, port: int) -> socket.socket:
     PortTaken
         If another process listens there.
     Conflict
-        If this machine does not have the address, or this user may not have the port.
+        If this machine does not have the address, this user may not have the port, or the host has characters that no
+        name has.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # With the protocol left out, asyncio would not set TCP_NODELAY on the connections: then the body of an answer
@@ -39,6 +40,9 @@ def bind(host: str, port: int) -> socket.socket:
     except OSError as error:
         bound.close()
         raise cannot_listen(host, port, error) from error
+    except TypeError as error:
+        bound.close()
+        raise Conflict(f"can't listen on {host!r}: this is not a host name") from error
     return bound
 
 

@@ -1,6 +1,7 @@
 """The command line without a service: its help, its exit codes, and the errors that it shows."""
 
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from services.cli.main import main
-from tests.services.cli.commands import ALL, ROOT, envmatte
+from tests.services.cli.commands import ALL, ROOT, UNREACHABLE, envmatte
 from tests.services.client.servers import JOB, ok, refusal, scripted_server
 
 README = (ROOT / "services/cli/README.md").read_text()
@@ -111,6 +112,7 @@ def test_errors_do_not_command_the_terminal() -> None:
         ["status"],
         ["upload", "no-such-file"],
         ["status", "j", "--url", "localhost:8000"],
+        ["status", os.fsdecode(b"not UTF-8: \xe9"), *UNREACHABLE],
         ["worker"],
         ["scheduler", "--host", "0.0.0.0"],
     ],

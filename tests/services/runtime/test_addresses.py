@@ -1,6 +1,7 @@
 """Addresses that a process listens on."""
 
 import asyncio
+import os
 import socket
 
 import pytest
@@ -25,6 +26,12 @@ def test_an_address_that_is_not_this_machines_is_reported() -> None:
         Conflict, match=r"can't listen on 192\.0\.2\.1, port 0: Cannot assign requested address"
     ):
         bind("192.0.2.1", 0)
+
+
+@pytest.mark.parametrize("host", [os.fsdecode(b"caf\xe9"), "a\0b"])
+def test_what_is_no_host_name_is_reported(host: str) -> None:
+    with pytest.raises(Conflict, match="not a host name"):
+        bind(host, 0)
 
 
 def test_connections_send_without_delay() -> None:
