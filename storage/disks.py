@@ -1,14 +1,17 @@
 """How full a disk may be: uploads leave a reserve to the database and to the jobs that are under way."""
 
+import os
 import shutil
 from pathlib import Path
 
-from storage.errors import NEARLY_FULL, NoRoom
+from storage.errors import FEW_FILES, NEARLY_FULL, NoRoom
 
 RESERVE = 1 << 30
 """Most bytes that are kept in reserve on a disk."""
+FILES = 10_000
+"""Most files that are kept in reserve: a matte of some megapixels is a thousand."""
 SHARE = 20
-"""On a small disk the reserve is its size divided by this."""
+"""On a small disk the reserve is what it holds divided by this."""
 
 
 def spare_bytes(folder: Path) -> int:
@@ -27,6 +30,9 @@ def require_reserve(folder: Path) -> None:
     disk = shutil.disk_usage(folder)
     if disk.free < _reserve(disk.total) // 2:
         raise NoRoom(NEARLY_FULL)
+    files = os.statvfs(folder)
+    if files.f_favail < min(files.f_files // SHARE, FILES) // 2:  # f_files is 0 where there is no limit
+        raise NoRoom(FEW_FILES)
 
 
 def _reserve(total: int) -> int:

@@ -34,6 +34,11 @@ NEARLY_FULL = (
     "on the disk, and try again; everything stored before is kept"
 )
 
+FEW_FILES = (
+    "the disk takes hardly any more files: delete captures, mattes or uploads, or other files on the disk, and try "
+    "again; everything stored before is kept"
+)
+
 
 class EnvmatteError(Exception):
     """Base of every error that a caller can act on.

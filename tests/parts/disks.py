@@ -9,10 +9,13 @@ import pytest
 
 
 @contextmanager
-def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    """Mount a small file system until the block ends; skips the test without the right to mount."""
+def small_disk(folder: Path, size: int, files: int = 0) -> Iterator[Path]:
+    """Mount a small file system until the block ends; skips the test without the right to mount.
+
+    It takes any number of ``files`` if that is 0.
+    """
     folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size},nr_inodes={files}", "tmpfs", str(folder)]
     try:
         made = subprocess.run(mount, capture_output=True, text=True)
     except FileNotFoundError:

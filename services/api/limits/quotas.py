@@ -214,5 +214,6 @@ def _room_of_service(connection: Connection, settings: Settings) -> int | None:
 def _room_on_disk(connection: Connection, objects: Objects) -> int | None:
     """Bytes of the disk that uploads may take, without those that bodies under way have reserved."""
     marker.require_mounted(objects)
+    objects.require_reserve()  # of files too
     spare = objects.spare_bytes()
     return None if spare is None else spare - statistics.coming_bytes(connection)

@@ -18,10 +18,12 @@ from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import for_owner
 from storage.database.rows import PAUSE, ROW, json_bytes
 from storage.database.tables import uploads
+from storage.errors import FEW_FILES
 from storage.objects.store import Objects
 from storage.records import api_keys, captures, jobs, mattes, tiles
 from storage.statistics import PART, PROMISE, TILE
 from tests.parts.captures import nested_program
+from tests.parts.disks import small_disk
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 
@@ -63,6 +65,21 @@ def serve(engine: Engine, tmp_path: Path) -> Serve:
 
 def files(tmp_path: Path) -> list[Path]:
     return [path for path in (tmp_path / "store").rglob("*") if path.is_file()]
+
+
+def test_disk_that_takes_hardly_any_more_files(engine: Engine, tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 32 << 20, files=2000) as disk:
+        app = build_app(Settings(data=tmp_path), engine, Objects((disk / "store").as_uri()))
+        headers = {"Authorization": f"Bearer {tmp_path.joinpath('alice').read_text()}"}
+        service = TestClient(app, headers=headers)
+        empty = TUS | {"Upload-Length": "1"}
+        assert service.post("/v1/uploads", headers=empty).status_code == 201
+        for n in range(1960):
+            (disk / str(n)).touch()
+        answer = service.post("/v1/uploads", headers=empty)
+        assert (answer.status_code, answer.json()["detail"]) == (507, FEW_FILES)
+        found = service.get("/readyz")
+        assert (found.status_code, found.json()["store"]) == (503, FEW_FILES)
 
 
 def refused(answer: Any, status: int, name: str, limit: int, value: int) -> dict[str, Any]:

@@ -243,6 +243,7 @@ export const de = {
 	"the database cannot be reached or is busy; try again in a few seconds": "die Datenbank ist nicht erreichbar oder überlastet; in ein paar Sekunden erneut versuchen",
 	"the disk is full, apart from a reserve for what is under way: delete captures, mattes or uploads, or free space on the disk, and try again; everything stored before is kept": "die Platte ist voll bis auf eine Reserve für das, was läuft: Aufnahmen, Matten oder Uploads löschen oder Platz auf der Platte schaffen und erneut versuchen; alles Gespeicherte bleibt",
 	"the disk is full: delete captures, mattes or uploads, or free space on the disk, and try again; everything stored before is kept": "die Platte ist voll: Aufnahmen, Matten oder Uploads löschen oder Platz auf der Platte schaffen und erneut versuchen; alles Gespeicherte bleibt",
+	"the disk takes hardly any more files: delete captures, mattes or uploads, or other files on the disk, and try again; everything stored before is kept": "die Platte nimmt kaum noch Dateien auf: Aufnahmen, Matten oder Uploads oder andere Dateien auf der Platte löschen und erneut versuchen; alles Gespeicherte bleibt",
 	"the drift of the camera": "die Bewegung der Kamera",
 	"the file can't be decoded: it is damaged, or of an unusual kind; {advice}": "die Datei ist nicht lesbar: Sie ist beschädigt oder von ungewöhnlicher Art; {advice}",
 	"the flicker of the light": "das Flackern des Lichts",
