@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import tempfile
 from multiprocessing import forkserver, popen_forkserver, resource_tracker
 
 import dask
@@ -24,7 +25,7 @@ def start_forkserver(*modules: str) -> None:
     Raises
     ------
     Unavailable
-        If processes can't share locks here, which dask needs.
+        If processes can't share locks here, which dask needs, or the folder of temporary files takes no sockets.
     """
     try:
         os.chdir(os.getcwd())
@@ -45,7 +46,13 @@ def start_forkserver(*modules: str) -> None:
         ) from error
     get_mp_context().set_forkserver_preload([*modules])  # replaces what distributed has set
     popen_forkserver.Popen.terminate = popen_forkserver.Popen.kill  # type: ignore[method-assign]  # SIGTERM is blocked
-    ensure_running()
+    try:
+        ensure_running()
+    except OSError as error:
+        raise Unavailable(
+            f"workers can't be started by a socket in {tempfile.gettempdir()}: {error}. Set TMPDIR to a folder with a "
+            "shorter path, such as /tmp"
+        ) from error
 
 
 def ensure_running() -> None:

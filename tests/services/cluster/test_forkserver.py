@@ -34,6 +34,19 @@ def test_machine_without_shared_memory_is_named(tmp_path: Path) -> None:
     assert "Traceback" not in served.stderr
 
 
+def test_folder_whose_path_is_too_long_for_sockets_is_named(tmp_path: Path) -> None:
+    long = tmp_path / ("long" * 25)
+    long.mkdir()
+    serve = [sys.executable, "-m", "services", "serve", "--data", str(tmp_path / "data"), "--port", "0"]
+    environment = os.environ | {"TMPDIR": str(long)}
+    served = subprocess.run(serve, env=environment, capture_output=True, text=True, timeout=120)
+    assert served.returncode == 1
+    assert served.stderr.splitlines()[-1] == (
+        f"Error: workers can't be started by a socket in {long}: AF_UNIX path too long. Set TMPDIR to a folder with a "
+        "shorter path, such as /tmp"
+    )
+
+
 def test_workers_do_not_run_the_code_of_the_working_directory(tmp_path: Path) -> None:
     (tmp_path / "services").mkdir()
     (tmp_path / "services" / "__init__.py").write_text("open('imported', 'w').close(); raise SystemExit")
