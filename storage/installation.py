@@ -8,7 +8,7 @@ from storage.database.tables import captures, installation, mattes
 from storage.errors import StoreUnavailable, WrongStore
 from storage.maintenance import inventory
 from storage.objects import marker
-from storage.objects.store import Objects
+from storage.objects.store import Objects, folder_of
 
 ENOUGH = 1000
 """Names of things in the store that are looked up, at most."""
@@ -74,18 +74,24 @@ def recognise(engine: Engine, objects: Objects, *, mark: bool = True) -> str | N
     return id
 
 
-def require(engine: Engine, objects: Objects) -> None:
-    """Check that a store has the id of its database, which may have the schema of an earlier version.
+def open_store(engine: Engine, url: str) -> Objects:
+    """The store that has the id of its database, which may have the schema of an earlier version.
 
     Raises
     ------
     WrongStore
+        If it has another one or none. Its folder is not made.
     StoreUnavailable
     """
     with reading(engine) as c:
         id = find(c) if inspect(c).has_table(installation.name) else None
+    folder = folder_of(url)
+    if id is not None and folder is not None and not folder.is_dir():
+        raise marker.wrong_store()
+    objects = Objects(url)
     if id is not None:
         marker.require(objects, id)
+    return objects
 
 
 def _require_known(engine: Engine, objects: Objects) -> None:

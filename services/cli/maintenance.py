@@ -38,15 +38,12 @@ def _opened(given: dict[str, Any]) -> Iterator[tuple["Settings", "Engine", "Obje
     from services.settings import Settings
     from storage import installation
     from storage.maintenance.row_dump import open_without_upgrade
-    from storage.objects.store import Objects
 
     settings = Settings(**drop_unset(given))
     engine = open_without_upgrade(settings.database_url)
     try:
-        objects = Objects(settings.store_url)
         # In another store all would be missing, with advice to upload it again.
-        installation.require(engine, objects)
-        yield settings, engine, objects
+        yield settings, engine, installation.open_store(engine, settings.store_url)
     finally:
         engine.dispose()
 
@@ -139,17 +136,15 @@ def restore(source: str, as_json: bool, **given: Any) -> None:
     Database and store may be of other kinds than those the backup was made from. Every byte is checked on the way. The
     restore is complete or leaves nothing. `envmatte serve` then continues the jobs that were running.
     """
-    from urllib.request import url2pathname
-
     from services.runtime.data_folder import lock_data, make_data
     from services.settings import Settings
     from storage.database import dialects
     from storage.errors import NotFound
     from storage.maintenance.restore import restore
-    from storage.objects.store import Objects
+    from storage.objects.store import Objects, folder_of
 
-    folder = Path(url2pathname(urlsplit(source).path))
-    if source.startswith("file:") and not folder.is_dir():  # opening it would create it
+    folder = folder_of(source)
+    if folder is not None and not folder.is_dir():  # opening it would create it
         raise NotFound(f"there is no folder {folder}: name the one that `envmatte backup` wrote to")
     settings = Settings(**drop_unset(given))
     make_data(settings.data)

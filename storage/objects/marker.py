@@ -54,7 +54,12 @@ def require(objects: Objects, installation: str, machine: str = "this machine") 
     StoreUnavailable
     """
     if read(objects) != installation:
-        raise WrongStore(
-            f"{machine} does not see the store of this installation: its folder may not be mounted there, or its "
-            f"bucket is another one. If it is the right store, copy the object `{PATH}` of the former one into it"
-        )
+        raise wrong_store(machine)
+
+
+def wrong_store(machine: str = "this machine") -> WrongStore:
+    """The error for a store that is not that of the installation, as far as a machine can see."""
+    return WrongStore(
+        f"{machine} does not see the store of this installation: its folder may not be mounted there, or its "
+        f"bucket is another one. If it is the right store, copy the object `{PATH}` of the former one into it"
+    )

@@ -42,6 +42,11 @@ CROSSED = (errno.ENOENT, errno.ENOTEMPTY, errno.EISDIR)
 """Errors of a removal that others have crossed."""
 
 
+def folder_of(url: str) -> Path | None:
+    """The folder that a URL of objects names; None for a bucket."""
+    return Path(url2pathname(urlsplit(url).path)) if url.startswith("file:") else None
+
+
 class Objects:
     """Objects under a URL, in a folder or a bucket.
 
@@ -70,9 +75,8 @@ class Objects:
         self.installation: str | None = None
         """What the store is recognised by once it has been found to be right, see `storage.objects.marker`."""
         self._store: ObjectStore
-        self._folder: Path | None = None
-        if url.startswith("file:"):
-            self._folder = Path(url2pathname(urlsplit(url).path))
+        self._folder = folder_of(url)
+        if self._folder is not None:
             # Deleting the last object of a folder, also by zarr, deletes the folder.
             try:
                 self._store = LocalStore.from_url(url, mkdir=True, automatic_cleanup=True)

@@ -44,3 +44,5 @@ def test_a_store_that_is_not_mounted_is_named_rather_than_all_that_is_missing(
     assert done.exit_code == 1
     assert "does not see the store of this installation" in done.stderr
     assert done.stdout == ""
+    assert not (tmp_path / "unmounted").exists()
+    assert not (tmp_path / "target").exists()
