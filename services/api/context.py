@@ -22,7 +22,7 @@ from services.decoding.pool import Decoders
 from services.settings import Settings
 from storage.database.engine import reading
 from storage.database.owners import for_owner
-from storage.errors import Corrupt, TooMany, Unavailable
+from storage.errors import Corrupt, InvalidInput, TooMany, Unavailable
 from storage.objects.store import Objects
 from workflows.composite.cache import Cache
 
@@ -195,6 +195,19 @@ OwnerContext = Annotated[Context, Depends(authorized)]
 
 PublicContext = Annotated[Context, Depends(_service_context)]
 """For routes without a key, which must check otherwise what a request may see: sees what belongs to any owner."""
+
+
+def _for_lists(request: Request, context: OwnerContext) -> Context:
+    """A filter that is misspelt would list all, and what follows may delete all."""
+    known = {one.alias for one in request.scope["route"].dependant.query_params}
+    for name in request.query_params:
+        if name not in known:
+            raise InvalidInput(f"{name}: this list takes {', '.join(sorted(known))}", field=name)
+    return context
+
+
+ListContext = Annotated[Context, Depends(_for_lists)]
+"""For lists: the same, and refuses parameters that the list does not have."""
 
 
 def _for_admins(request: Request, context: OwnerContext) -> Context:

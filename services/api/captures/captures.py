@@ -8,7 +8,7 @@ from fastapi import Request, Response
 from pydantic import BaseModel, Field
 from sqlalchemy import Connection, Row
 
-from services.api.context import OwnerContext
+from services.api.context import ListContext, OwnerContext
 from services.api.http.responses import bytes_response, json_response, utc_time
 from services.api.http.router import Router
 from services.api.http.types import After, Named, PageSize
@@ -89,7 +89,7 @@ class Captures(BaseModel):
 
 @router.get("/captures", response_model=Captures)
 async def list_captures(
-    context: OwnerContext,
+    context: ListContext,
     request: Request,
     limit: PageSize = 100,
     after: After = None,

@@ -8,7 +8,7 @@ from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection
 
-from services.api.context import Context, OwnerContext
+from services.api.context import Context, ListContext, OwnerContext
 from services.api.http.bodies import json_body, read_json
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.responses import json_response
@@ -168,7 +168,7 @@ def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
 
 @router.get("/jobs", response_model=Jobs)
 async def list_jobs(
-    context: OwnerContext,
+    context: ListContext,
     request: Request,
     limit: PageSize = 100,
     after: After = None,

@@ -10,7 +10,7 @@ from fastapi import Request, Response
 from pydantic import BaseModel, Field
 from sqlalchemy import Connection, Row
 
-from services.api.context import Context, OwnerContext
+from services.api.context import Context, ListContext, OwnerContext
 from services.api.http.responses import json_response, utc_time
 from services.api.http.router import Router
 from services.api.http.types import After, Named, PageSize, Pair
@@ -78,7 +78,7 @@ class Mattes(BaseModel):
 
 @router.get("/mattes", response_model=Mattes)
 async def list_mattes(
-    context: OwnerContext,
+    context: ListContext,
     request: Request,
     limit: PageSize = 100,
     after: After = None,

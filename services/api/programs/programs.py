@@ -8,7 +8,7 @@ from fastapi import Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sqlalchemy import Row
 
-from services.api.context import OwnerContext
+from services.api.context import ListContext, OwnerContext
 from services.api.http.bodies import json_body, read_json
 from services.api.http.responses import json_response
 from services.api.http.router import Router
@@ -195,7 +195,7 @@ def post_program(
 
 @router.get("/programs", response_model=Programs)
 async def list_programs(
-    context: OwnerContext, request: Request, limit: PageSize = 100, after: After = None
+    context: ListContext, request: Request, limit: PageSize = 100, after: After = None
 ) -> Response:
     """Programs, newest first, without their parts."""
 

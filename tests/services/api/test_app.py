@@ -49,6 +49,15 @@ def test_body_with_a_content_coding_is_refused(app: FastAPI, route: str) -> None
     assert answer.json().get("field") != "Content-Encoding"
 
 
+@pytest.mark.parametrize("kind", ["captures", "jobs", "mattes", "programs"])
+def test_list_refuses_a_filter_that_it_does_not_have(app: FastAPI, kind: str) -> None:
+    client = TestClient(app, "http://127.0.0.1")
+    assert client.get(f"/v1/{kind}", params={"limit": 1}).json()[kind] == []
+    answer = client.get(f"/v1/{kind}", params={"limit": 1, "stat": "running"})
+    assert (answer.status_code, answer.json()["field"]) == (422, "stat")
+    assert answer.json()["detail"].startswith("stat: this list takes after, ")
+
+
 def test_head_ignores_range(app: FastAPI) -> None:
     client = TestClient(app, "http://127.0.0.1")
     whole = client.get("/docs")
