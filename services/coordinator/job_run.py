@@ -29,6 +29,8 @@ TASKS = 250
 """How many tasks a second a scheduler is given at most. Each takes a millisecond of its only core, or two."""
 LOSSES = 8
 """How often a tile may be lost before its job fails. Most workers die of something else, such as being turned off."""
+STEP = 1.0
+"""Seconds by which a clock that was set, or a machine that slept, has spoilt the pace that was measured."""
 HOLD = 5.0
 """Seconds until the next tiles of a job are submitted after one could not reach the store."""
 REMEDY = "give workers more memory (ENVMATTE_WORKER_MEMORY) or have them use less (ENVMATTE_INGEST_MEMORY), and retry"
@@ -74,6 +76,8 @@ class JobRun:
         When outcomes were last written.
     paced : int
         Number of threads of the cluster when the pace of its tiles was last measured; 0 until it was.
+    clock : float
+        How far the clock was ahead of the time since this machine started, then.
     trace : str, optional
         The ``traceparent`` of the request that asked for the job.
     paused : bool
@@ -100,6 +104,7 @@ class JobRun:
     outcomes: list[Outcome] = field(default_factory=list)
     written_at: float = 0.0
     paced: int = 0
+    clock: float = 0.0
     trace: str | None = None
     paused: bool = False
     region: list[int] | None = None
@@ -236,7 +241,9 @@ class JobRun:
             if tile < 0 and "missing" not in result
         ]
         tile_records.mark_done(connection, self.job, tiles + steps)
-        if tiles and self.paced != threads:
+        clock = time.time() - time.monotonic()
+        if tiles and (self.paced != threads or abs(clock - self.clock) > STEP):
+            self.clock = clock
             # Not from the first tiles: their workers load what later ones find loaded.
             self.paced = threads if tile_records.start_pace(connection, self.job, after=threads) else 0
         return results

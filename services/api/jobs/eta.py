@@ -17,7 +17,7 @@ STEPS = 1.0
 
 
 def seconds_left(row: Row[Any], now: float, situation: Situation) -> float | None:
-    """Seconds until a running job has succeeded; None until the pace of its tiles is known.
+    """Seconds until a running job has succeeded; None until the pace of its tiles is known, or if the last are late.
 
     Parameters
     ----------
@@ -33,7 +33,12 @@ def seconds_left(row: Row[Any], now: float, situation: Situation) -> float | Non
     if row.paced_at is None or row.done <= row.paced_done or row.moved_at <= row.paced_at:
         return None  # the last: the clock has gone back
     pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)
-    return float(max((row.total - row.done) * pace - (now - row.moved_at), 0.0)) + finishing
+    sign = situation.heartbeat
+    workers = len(sign.cluster["workers"]) if sign else 0
+    # No more has been done meanwhile than each worker's tile: workers may have stopped, or the clock gone forward.
+    since = min(now - row.moved_at, pace * max(workers, 1))
+    left = float((row.total - row.done) * pace - since)
+    return left + finishing if left > 0 else None
 
 
 def seconds_to_recover(connection: Connection, capture: Row[Any]) -> dict[str, float] | None:

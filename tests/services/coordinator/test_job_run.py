@@ -260,6 +260,19 @@ def test_pace_is_measured_again_where_it_changes(connection: Connection, job: st
     assert [paced_from(threads=3), paced_from(0, threads=3)] == [None, 9]
 
 
+@pytest.mark.parametrize("hours", [1, -1])
+def test_pace_is_measured_again_after_the_clock_was_set(
+    connection: Connection, job: str, monkeypatch: pytest.MonkeyPatch, hours: int
+) -> None:
+    run, now = working(connection, job, tiles=9), time.time
+    advance(connection, run, done(run, 0), done(run, 1), under_way=1)
+    assert jobs.get(connection, job).paced_done == 2
+    monkeypatch.setattr(time, "time", lambda: now() + hours * 3600)
+    advance(connection, run, done(run, 2), under_way=1)
+    row = jobs.get(connection, job)
+    assert (row.paced_done, row.moved_at - row.paced_at) == (3, pytest.approx(0, abs=60))
+
+
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_cancelled_job_neither_succeeds_nor_fails(connection: Connection, job: str, fails: bool) -> None:
     run = working(connection, job)

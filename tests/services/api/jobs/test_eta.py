@@ -50,6 +50,17 @@ def test_recovery_continues_at_its_pace(engine: Engine) -> None:
         assert left(c, running(c, "recover", 2, paced_at=None), 2.0) is None
 
 
+def test_workers_that_stop_do_not_use_up_the_time_left(engine: Engine) -> None:
+    with writing(engine) as c:
+        token = leases.acquire(c, "here")
+        assert token is not None
+        leases.renew(c, token, {"workers": [{}] * 3, "problem": None})
+        job = running(c, "recover", 2)
+        assert [left(c, job, now) for now in (4.0, 5.0, 60.0, 3600.0)] == [6.0, 5.0, 5.0, 5.0]
+        last = running(c, "recover", 8)
+        assert [left(c, last, now) for now in (9.0, 10.0, 60.0)] == [1.0, None, None]
+
+
 def test_ingest_has_a_step_after_its_tiles(engine: Engine) -> None:
     with writing(engine) as c:
         assert left(c, running(c, "ingest", 2), 2.0) == pytest.approx(8 + FINISHING)
