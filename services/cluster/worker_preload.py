@@ -95,7 +95,7 @@ async def _leave(worker: Worker) -> None:
     A task of another job may have come since: for the scheduler a thread is free as soon as its task is cancelled.
     """
     leaving = worker.scheduler.unregister(
-        address=worker.address, expected=True, close=False, stimulus_id="ended-for-a-cancelled-task"
+        address=worker.address, expected=True, close=False, stimulus_id="worker-leaves"
     )
     with suppress(OSError, TimeoutError):  # it ends all the same
         await asyncio.wait_for(leaving, ANSWER)
