@@ -24,6 +24,8 @@ TEXT = "%(asctime)s %(levelname)s %(name)s %(about)s%(message)s"
 LEVELS = logging.getLevelNamesMapping()
 PACKAGES = ("services", "workflows", "storage")
 """Our own, which log from the level that is set; other libraries from INFO at the lowest."""
+LOGGED = "_is_logged"
+"""Attribute of an error of a request that has been logged: the framework raises it again, for the server to log."""
 FIELDS = {"levelname": "level", "name": "logger", "message": "message"}
 """Attributes of a log record in JSON, and what they are called there."""
 
@@ -115,8 +117,9 @@ def _add_about(record: logging.LogRecord) -> bool:
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Whether a line of uvicorn says more than ours: why an answer ends early is logged where it ends."""
-    return "returned without completing response" not in record.getMessage()
+    """Whether a line of uvicorn says more than ours: why an answer ends early, or fails, is logged where it does."""
+    logged = record.exc_info and hasattr(record.exc_info[1], LOGGED)
+    return not logged and "returned without completing response" not in record.getMessage()
 
 
 def _log_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match, Mount
 
+from services.runtime.logs import LOGGED
 from services.runtime.problems import MEDIA_TYPE, CodedBody, Unauthorized, problem_detail, problem_of
 from storage.errors import Corrupt, EnvmatteError, InvalidInput, StoreUnavailable, TooMany, Unavailable
 from storage.objects import marker
@@ -94,6 +95,7 @@ def register(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def _unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("%s %s", request.method, request.url.path, exc_info=error)
+        setattr(error, LOGGED, True)
         # The framework raises the error again, and the server then disconnects.
         return problem_response(problem_of(error), {"Connection": "close"})
 

@@ -1,6 +1,8 @@
 """Errors as answers: headers that a status needs besides the problem detail."""
 
 import os
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -20,6 +22,31 @@ from services.runtime.problems import Unauthorized
 from storage.errors import Corrupt, EnvmatteError, NotFound, Unavailable
 from storage.objects import marker
 from storage.objects.store import Objects
+
+UNEXPECTED = """
+import threading, httpx2, uvicorn
+from fastapi import FastAPI
+from services.api.http.errors import register
+from services.runtime.logs import configure_logging
+
+app = FastAPI()
+register(app)
+
+@app.get("/")
+def fail() -> None:
+    raise ValueError("a bug")
+
+configure_logging("text", "INFO", "test")
+server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, log_level="warning", lifespan="off"))
+thread = threading.Thread(target=server.run)
+thread.start()
+while not server.started:
+    pass
+port = server.servers[0].sockets[0].getsockname()[1]
+assert httpx2.get(f"http://127.0.0.1:{port}/").status_code == 500
+server.should_exit = True
+thread.join()
+"""
 
 
 @pytest.mark.parametrize(
@@ -143,3 +170,10 @@ def test_unexpected_error_announces_that_the_connection_is_closed() -> None:
     with TestClient(app, raise_server_exceptions=False) as client:
         answer = client.get("/")
     assert (answer.status_code, answer.headers["connection"]) == (500, "close")
+
+
+def test_unexpected_error_is_logged_once() -> None:
+    done = subprocess.run([sys.executable, "-c", UNEXPECTED], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "ERROR services.api.http.errors GET /" in done.stderr
+    assert done.stderr.count("ValueError: a bug") == 1
