@@ -1,6 +1,8 @@
 """Options that several commands share."""
 
 import math
+import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -12,7 +14,18 @@ from services.runtime.environment import read_environment
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-InputFile = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+class _InputFile(click.Path):
+    """A file to read. A pipe can be read only once, and commands look at files first: it is copied to a file."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        file = cast(Path, super().convert(value, param, ctx))
+        if file.is_file() or ctx is None:
+            return file
+        copy = Path(ctx.with_resource(tempfile.TemporaryDirectory(prefix="envmatte-input-")), file.name)
+        with file.open("rb") as source, copy.open("wb") as target:
+            shutil.copyfileobj(source, target)
+        return copy
 
 
 class _OutputFile(click.Path):
@@ -42,6 +55,7 @@ class NumberRange(click.FloatRange):
         return super().convert(Number.convert(value, param, ctx), param, ctx)
 
 
+InputFile = _InputFile(exists=True, dir_okay=False, path_type=Path)
 Number = _Number()
 """A finite number."""
 OutputFile = _OutputFile(dir_okay=False, path_type=Path)

@@ -231,10 +231,8 @@ def write_archive(target: BinaryIO | Path, manifest: Mapping[str, Any], files: M
             archive.write(path, name)
 
 
-def is_film(file: Path | bytes) -> bool:
-    """Whether a file, or what was read of one, begins as a video does."""
-    if isinstance(file, bytes):
-        return is_video(file)
+def is_film(file: Path) -> bool:
+    """Whether a file begins as a video does."""
     with file.open("rb") as source:
         return is_video(source.read(LENGTH))
 

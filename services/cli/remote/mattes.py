@@ -68,11 +68,7 @@ def composite(
     A clip (a video file) is composited by a job, frame by frame. An interrupt cancels the job.
     """
     given = options.drop_unset(params)
-    # A pipe can be read only once.
-    picture = backdrop if backdrop.is_file() else backdrop.read_bytes()
-    is_clip = is_film(picture)
-    if is_clip and picture is not backdrop:
-        raise click.UsageError(f"{backdrop} is a clip, which is read more than once: save it to a file")
+    is_clip = is_film(backdrop)
     ends = [".mp4"] if is_clip else list(MEDIA_TYPES)
     if output.suffix.lower() not in ends:
         raise click.BadParameter(f"{output}: the name must end in {', '.join(ends)}", param_hint="--output")
@@ -81,7 +77,7 @@ def composite(
             _composite_clip(client, matte, backdrop, output, given)
         else:
             kind = MEDIA_TYPES[output.suffix.lower()]
-            write(output, client.composite(matte, picture, kind=kind, **given))
+            write(output, client.composite(matte, backdrop, kind=kind, **given))
     print_output(output, as_json)
 
 

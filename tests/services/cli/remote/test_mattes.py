@@ -2,6 +2,7 @@
 
 import json
 import os
+import tempfile
 import threading
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -11,13 +12,23 @@ from click.testing import CliRunner
 
 from services.cli.main import main
 from tests.services.cli.commands import COMMAND, interrupted
-from tests.services.client.servers import ok, scripted_server, web_server
+from tests.services.client.servers import JOB, ok, scripted_server, web_server
+
+MATTE = {
+    "id": "m",
+    "state": "ready",
+    "created_at": "",
+    "capture": None,
+    "job": None,
+    "options": {},
+    "width": 1,
+    "height": 1,
+    "monitor": [1, 1],
+}
 
 
 def test_exit_code_130_and_no_files_after_interrupted_layers(tmp_path: Path) -> None:
     arrived, finished = threading.Event(), threading.Event()
-    matte = {"id": "m", "state": "ready", "created_at": "", "capture": None, "job": None, "options": {}}
-    matte |= {"width": 1, "height": 1, "monitor": [1, 1]}
 
     class Slow(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -25,7 +36,7 @@ def test_exit_code_130_and_no_files_after_interrupted_layers(tmp_path: Path) -> 
                 arrived.set()
                 finished.wait(60)
                 return
-            body = b"pixels" if "layers" in self.path else json.dumps(matte).encode()
+            body = b"pixels" if "layers" in self.path else json.dumps(MATTE).encode()
             self.send_response(200)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
@@ -90,20 +101,29 @@ def test_clips_and_stills_differ_by_their_first_bytes(tmp_path: Path, start: byt
 
 
 @pytest.mark.parametrize(
-    ("start", "code"), [(b"\x89PNG\r\n\x1a\n", 0), (b"\0\0\0\x18ftypisom", 2)], ids=["picture", "clip"]
+    ("start", "command", "output"),
+    [
+        (b"\x89PNG\r\n\x1a\n", ["composite", "m"], "out.png"),
+        (b"\0\0\0\x18ftypisom", ["composite", "m"], "out.mp4"),
+        (b"PK\3\4", ["import"], None),
+    ],
+    ids=["picture", "clip", "matte"],
 )
-def test_a_backdrop_from_a_pipe(tmp_path: Path, start: bytes, code: int) -> None:
-    sent = start + bytes(300)
+def test_files_may_be_pipes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: bytes, command: list[str], output: str | None
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    sent = start + bytes(100_000)
     os.mkfifo(tmp_path / "pipe")
     writer = threading.Thread(target=lambda: (tmp_path / "pipe").write_bytes(sent), daemon=True)
     writer.start()
-    with scripted_server(lambda n: (200, {}, b"a composite")) as (url, calls):
-        output = tmp_path / "out.png"
-        command = ["composite", "m", str(tmp_path / "pipe"), "-o", str(output), "--url", url]
-        done = CliRunner().invoke(main, command)
+    done = json.dumps(JOB | MATTE | {"state": "succeeded"}).encode()
+    with scripted_server(lambda n: (200, {}, done)) as (url, calls):
+        written = ["-o", str(tmp_path / output)] if output else []
+        result = CliRunner().invoke(main, [*command, str(tmp_path / "pipe"), *written, "--url", url])
         writer.join(60)
-    assert done.exit_code == code, done.output
-    if code:
-        assert "save it to a file" in done.stderr
-    else:
-        assert [call["body"] for call in calls] == [sent]
+    assert result.exit_code == 0, result.output
+    assert calls[0]["body"] == sent
+    assert not list(temporary.iterdir())
