@@ -2,6 +2,7 @@
 
 import io
 from itertools import pairwise
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +43,13 @@ def contact_sheet(stack: Stack) -> bytes:
     height, width = light.shape[1:3]
     rows = -(-len(picked) // ACROSS)
     across = min(ACROSS, len(picked))
-    sheet = Image.new("RGB", (across * (width + 8) + 8, rows * (height + CAPTION + 8) + 8), (32, 32, 32))
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
+    font = ImageFont.load_default(12)
+    # Upright or small frames are narrower than their captions.
+    column = max(width, *(ceil(font.getlength(caption)) for _, caption in picked)) + 8
+    sheet = Image.new("RGB", (across * column + 8, rows * (height + CAPTION + 8) + 8), (32, 32, 32))
+    draw = ImageDraw.Draw(sheet)
     for at, (_, caption) in enumerate(picked):
-        x, y = 8 + at % ACROSS * (width + 8), 8 + at // ACROSS * (height + CAPTION + 8)
+        x, y = 8 + at % ACROSS * column, 8 + at // ACROSS * (height + CAPTION + 8)
         values = _codes(light[at])
         values[low[at]], values[high[at]] = AT_BLACK, AT_WHITE
         sheet.paste(Image.fromarray(values), (x, y))

@@ -1,11 +1,12 @@
 """Contact sheets: small pictures of any capture, with what is clipped marked."""
 
 import io
+import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFont
 
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
@@ -27,6 +28,9 @@ RECORD = {
     "frames": [{"file": f"{n}.png", "pattern": n} for n in range(4)],
 }
 
+CAPTION = math.ceil(ImageFont.load_default(12).getlength("frame 1: brightest"))
+"""Width of the widest caption of its frames."""
+
 
 @pytest.mark.parametrize(
     ("width", "height"), [(40, 30), (30, 40), pytest.param(500, 31, marks=pytest.mark.slow)]
@@ -47,6 +51,9 @@ def test_clipped_pixels_are_marked(ingest: Ingest, width: int, height: int, dept
     black = pixels[8, first]
     assert (black == AT_BLACK).all(axis=1).mean() > 0.9
     assert (pixels == AT_WHITE).all(axis=2).sum() > 20
+    column = (pixels.shape[1] - 8) // 4
+    for between in range(4):  # captions stay within their columns
+        assert (pixels[:, between * column : between * column + 8] == 32).all()
 
 
 @pytest.mark.parametrize(("width", "height", "size"), [(3000, 1, (230, 1)), (1, 3000, (1, 230))])
@@ -58,12 +65,12 @@ def test_frames_of_one_row_or_column_are_drawn(
     with Image.open(io.BytesIO(thumbnail(stack))) as small:
         assert small.size == size
     with Image.open(io.BytesIO(contact_sheet(stack))) as sheet:
-        assert sheet.size == (4 * (size[0] + 8) + 8, size[1] + 18 + 16)
+        assert sheet.size == (4 * (max(size[0], CAPTION) + 8) + 8, size[1] + 18 + 16)
 
 
 def test_grey_frames_have_one_too(ingest: Ingest, make_zip: Callable[..., bytes]) -> None:
     files = {f"{n}.png": encode_png(np.full((12, 16, 1), 60 * n + 9, np.uint8)) for n in range(4)}
     with Image.open(io.BytesIO(contact_sheet(ingest("c", make_zip(RECORD, files))))) as sheet:
-        assert sheet.size == (4 * 24 + 8, 12 + 18 + 16)
+        assert sheet.size == (4 * (CAPTION + 8) + 8, 12 + 18 + 16)
     with Image.open(io.BytesIO(thumbnail(ingest("d", make_zip(RECORD, files))))) as small:
         assert (small.size, small.getcolors()) == ((16, 12), [(192, (69, 69, 69))])  # the white frame
