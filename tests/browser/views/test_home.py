@@ -229,6 +229,21 @@ def test_first_view_is_accessible_and_fits(
         assert [one["id"] for one in Axe().run(page).response["violations"]] == []
 
 
+@pytest.mark.parametrize("language", ["en-GB", "de-DE"])
+def test_choices_of_the_first_view_stand_in_rows(browser: Browser, service: Service, language: str) -> None:
+    with opened(browser, locale=language) as page:
+        page.goto(service.url)
+        choices = page.locator(".controls fieldset.thumbs")
+        expect(choices).to_have_count(2)
+        for width in (700, 1100, 1278, 1280, 1440):
+            page.set_viewport_size({"width": width, "height": 800})
+            for row in (*choices.all(), page.locator(".actions")):
+                places = row.locator("label.thumb-choice, a").all()
+                boxes = [box for one in places if (box := one.bounding_box())]
+                assert len({box["y"] for box in boxes}) == 1, width
+            assert boxes[0]["height"] < 45, width  # a line of the button to film
+
+
 def test_shipped_samples_are_small() -> None:
     files = list(SAMPLES.iterdir())
     assert {file.suffix for file in files} == {".json", ".live", ".webp", ".zip"}
