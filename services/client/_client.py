@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
 
 from services.client import _download
-from services.client._errors import NotFound, foreign
+from services.client._errors import FileChanged, NotFound, foreign
 from services.client._paths import id_of, path_of
 from services.client._records import Capture, Job, JobFailed, Layers, Matte, Record
 
@@ -291,10 +291,11 @@ class Client:
             ``transfer``, ``around``, ``fit``, ``right``, ``down``, ``scale`` and ``angle``, as the call takes them.
         """
         wanted |= {"webhook": webhook} if webhook else {}
-        headers = {"Content-Type": "video/*", "Content-Length": str(clip.stat().st_size)} | _key()
+        size = clip.stat().st_size
+        headers = {"Content-Type": "video/*", "Content-Length": str(size)} | _key()
         path = f"{path_of(Matte, matte)}/composite"
         return Job.of(
-            self._http.json("POST", path, params=wanted, headers=headers, content=lambda: _parts(clip))
+            self._http.json("POST", path, params=wanted, headers=headers, content=lambda: _parts(clip, size))
         )
 
     def video(self, job: Job | str, target: BinaryIO) -> None:
@@ -354,10 +355,11 @@ class Client:
         progress : callable, optional
             Is called with the bytes sent, and with all there are. The service checks them after the last.
         """
-        headers = {"Content-Type": "application/zip", "Content-Length": str(file.stat().st_size)} | _key()
+        size = file.stat().st_size
+        headers = {"Content-Type": "application/zip", "Content-Length": str(size)} | _key()
 
         def body() -> Iterator[bytes]:
-            return _parts(file, progress)
+            return _parts(file, size, progress)
 
         return self._matte(
             self._http.json(
@@ -386,11 +388,13 @@ def _key() -> dict[str, str]:
     return {"Idempotency-Key": secrets.token_hex(16)}
 
 
-def _parts(file: Path, progress: Callable[[int, int], None] | None = None) -> Iterator[bytes]:
-    """Read a file piece by piece."""
-    size = file.stat().st_size
+def _parts(file: Path, size: int, progress: Callable[[int, int], None] | None = None) -> Iterator[bytes]:
+    """Read as much of a file as was announced, piece by piece."""
     with file.open("rb") as source:
-        while data := source.read(SENT):
+        while source.tell() < size:
+            data = source.read(min(SENT, size - source.tell()))
+            if not data:
+                raise FileChanged
             yield data
             if progress:
                 progress(source.tell(), size)

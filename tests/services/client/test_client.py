@@ -1,5 +1,6 @@
 """The client against web servers that answer as a test says."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 import pytest
 
 from services import client as package
-from services.client import Client, JobFailed, NotFound, ServiceError
+from services.client import Client, FileChanged, JobFailed, NotFound, ServiceError
 from tests.services.client.servers import JOB, ok, refusal, scripted_server
 
 HEAVY = (
@@ -83,6 +84,25 @@ def test_an_id_reaches_no_other_path() -> None:
                 client.recover(id)
     ids = ["..%2Fcaptures", "a%2Fb", "a%20b%3Fc%23d%252F"]
     assert [call["call"] for call in calls] == [f"GET /v1/jobs/{id}" for id in ids]
+
+
+@pytest.mark.parametrize("size", [100_000, 300_000])
+def test_an_archive_that_changes_while_it_is_sent(tmp_path: Path, size: int) -> None:
+    """One that becomes shorter is an error; of one that grows, what was announced is sent."""
+    archive = tmp_path / "matte.zip"
+    archive.write_bytes(bytes(200_000))
+    matte = JOB | {"job": None, "width": 1, "height": 1, "monitor": [1, 1]}
+    with scripted_server(lambda n: ok(matte)) as (url, calls), Client(url) as client:
+
+        def change() -> object:
+            return client.import_matte(archive, progress=lambda sent, of: os.truncate(archive, size))
+
+        if size < 200_000:
+            with pytest.raises(FileChanged, match="became shorter"):
+                change()
+        else:
+            change()
+            assert [len(call["body"]) for call in calls] == [200_000]
 
 
 def test_package_is_marked_as_typed() -> None:
