@@ -27,6 +27,12 @@ STAGE = """async (job) => {
     stop.abort();
     return panel.querySelector(".stage").textContent;
 }"""
+FOLLOWED = """async (job) => {
+    const { followJob } = await import("/web/app/lib/job_progress.js");
+    window.panel = document.createElement("section");
+    followJob(panel, "none", new AbortController().signal, () => {}, job);
+    return panel.querySelector(".stage").textContent;
+}"""
 RATIOS = """(image) => [image.parentElement.clientWidth / image.parentElement.clientHeight,
     image.naturalWidth / image.naturalHeight]"""
 
@@ -126,6 +132,19 @@ def test_last_step_of_an_ingest_is_named(
     expect(desk.get_by_role("heading", level=1)).to_be_visible()
     job = {"kind": "ingest", "state": "running", "stage": stage, "progress": 0.5, "eta_seconds": eta}
     assert desk.evaluate(STAGE, job | {"tiles": {"total": 1, "done": 1, "failed": 0}}) == text
+
+
+def test_time_left_runs_down_while_no_event_comes(desk: Page, service: Service) -> None:
+    desk.clock.install()
+    desk.route("**/v1/jobs/none/*", lambda route: None)
+    desk.goto(f"{service.url}/#/jobs")
+    expect(desk.get_by_role("heading", level=1)).to_be_visible()
+    job = {"kind": "ingest", "state": "running", "stage": "finishing", "progress": 0.5, "eta_seconds": 20}
+    assert "about 20 s left" in desk.evaluate(FOLLOWED, job | {"tiles": {"total": 1, "done": 1, "failed": 0}})
+    for seconds, left in ((5, ", about 15 s left"), (14, ", about 1.0 s left"), (2, "")):
+        desk.clock.run_for(1000 * seconds)
+        shown = "running measuring and writing the report" + left
+        assert desk.evaluate("window.panel.querySelector('.stage').textContent") == shown
 
 
 @pytest.mark.parametrize("kind", ["capture", "matte"])
