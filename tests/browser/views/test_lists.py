@@ -107,6 +107,11 @@ def test_list_comes_back_by_itself_after_an_outage(
     desk.route("**/thumbnail.png", lambda route: route.abort("connectionreset"))
     desk.goto(f"{service.url}/#/captures")
     expect(desk.get_by_role("main").get_by_role("alert")).to_be_visible()
+    box = desk.get_by_role("main").get_by_role("alert").bounding_box()
+    again = desk.get_by_role("button", name="Try again").bounding_box()
+    assert box
+    assert again
+    assert again["y"] - box["y"] - box["height"] >= 8
     desk.unroute("**/v1/captures?*")
     entry = desk.locator(f'a[href="#/captures/{ready[0]}"]')
     expect(entry).to_be_visible()

@@ -13,7 +13,7 @@ const PAGE = 50; // entries
 export async function list(main, signal, { kind, states = [], named = false, busy, fixed = () => false, none, item, text }) {
 	const items = h("ul.list");
 	const nothing = h("div");
-	const problem = h("div");
+	const problem = h("div.stack");
 	const refused = h("div");
 	const search = h("input", { type: "search", maxlength: 200, "aria-label": t("list.search"), placeholder: t("list.search") });
 	const state = h("select", { "aria-label": t("list.state") }, h("option", { value: "" }, t("list.all")),
@@ -47,7 +47,7 @@ export async function list(main, signal, { kind, states = [], named = false, bus
 		} catch (error) {
 			signal.throwIfAborted();
 			// Otherwise a screen reader would read it again each time.
-			if (failed?.error.message !== error.message) problem.replaceChildren(problemBox(error), button(t("again"), refused, () => load(failed?.isMore)));
+			if (failed?.error.message !== error.message) problem.replaceChildren(problemBox(error), h("p", button(t("again"), refused, () => load(failed?.isMore))));
 			failed = { error, isMore };
 		}
 	});
