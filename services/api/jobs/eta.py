@@ -33,8 +33,8 @@ def seconds_left(row: Row[Any], now: float, situation: Situation) -> float | Non
     if row.paced_at is None or row.done <= row.paced_done or row.moved_at <= row.paced_at:
         return None  # the last: the clock has gone back
     pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)
-    sign = situation.heartbeat
-    workers = len(sign.cluster["workers"]) if sign else 0
+    heartbeat = situation.heartbeat
+    workers = len(heartbeat.cluster["workers"]) if heartbeat else 0
     # No more has been done meanwhile than each worker's tile: workers may have stopped, or the clock gone forward.
     since = min(now - row.moved_at, pace * max(workers, 1))
     left = float((row.total - row.done) * pace - since)
