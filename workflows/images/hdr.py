@@ -1,7 +1,8 @@
 """Codes for HDR displays (ITU-R BT.2100) as those of sRGB: phones film so by default.
 
 Light is that of the scene, without a display's system gamma: light of several sources adds up. The white of pages and
-skies in HDR, 203 cd/m2 or 75 % of HLG (ITU-R BT.2408, sect. 3), becomes white; what is brighter is clipped.
+skies in HDR, 203 cd/m2 or 75 % of HLG (ITU-R BT.2408, sect. 3), becomes white; what is brighter is clipped, unless room
+is made for it.
 """
 
 from functools import cache
@@ -31,7 +32,9 @@ def is_hdr(transfer: int) -> bool:
     return transfer in (PQ, HLG)
 
 
-def to_srgb(codes: NDArray[np.uint16], transfer: int, primaries: int) -> NDArray[np.uint16]:
+def to_srgb(
+    codes: NDArray[np.uint16], transfer: int, primaries: int, full: float = 1.0
+) -> NDArray[np.uint16]:
     """Convert RGB for HDR displays to sRGB.
 
     Parameters
@@ -42,12 +45,14 @@ def to_srgb(codes: NDArray[np.uint16], transfer: int, primaries: int) -> NDArray
         `PQ` or `HLG`.
     primaries : int
         Those other than `BT_2020` are left alone.
+    full : float
+        The light that becomes full scale; 1 is white.
 
     Returns
     -------
     (height, width, 3) uint16
     """
-    light_of, code_of = _light(transfer), _codes()
+    light_of, code_of = light_of_hdr(transfer) / np.float32(full), _codes()
     found = np.empty_like(codes)
     rows = max(1, BAND // codes.shape[1])
     for first in range(0, len(codes), rows):
@@ -60,8 +65,8 @@ def to_srgb(codes: NDArray[np.uint16], transfer: int, primaries: int) -> NDArray
 
 
 @cache
-def _light(transfer: int) -> NDArray[np.float32]:
-    """The light of every code, 1 for white (BT.2100, tables 4 and 5)."""
+def light_of_hdr(transfer: int) -> NDArray[np.float32]:
+    """The light of every code of 16 bits, 1 for white (BT.2100, tables 4 and 5)."""
     code = np.arange(TOP + 1) / TOP
     if transfer == PQ:
         root = code ** (32 / 2523)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from workflows.images.hdr import is_hdr, light_of_hdr
 from workflows.ingest.video.decoder import Clip, open_clip
 from workflows.ingest.video.frame_means import Share, mean_frames
 from workflows.ingest.video.signatures import CELLS, LARGE_CELLS, LargeFrames, Signatures, take_signatures
@@ -17,6 +18,11 @@ Positive = Annotated[int, Field(ge=1)]
 THREADS = 4
 """Threads that decode a film from its first frame to its last, when no other worker can help: with two, a core of two
 waits while small copies are made, and a film of 76 s in full HD takes 13.1 s rather than 11.6."""
+
+
+HEADROOM = 1.1
+"""Full scale of a film for HDR displays, relative to the brightest part of the monitor: leaves room for noise and
+for what compression overshoots."""
 
 
 class Film(BaseModel):
@@ -31,6 +37,8 @@ class Film(BaseModel):
     stated_duration : float
         In seconds; 0 if none is stated.
     interlaced : bool
+    transfer : int
+        Transfer characteristics of its first frame (ITU-T H.273, table 3).
     lost : list of int
         The first and the last time, in ticks, of the frames that could not be decoded; empty if all could be.
     """
@@ -43,6 +51,7 @@ class Film(BaseModel):
     denominator: Positive
     stated_duration: Annotated[float, Field(ge=0)]
     interlaced: bool
+    transfer: Annotated[int, Field(ge=0, le=255)]
     lost: Annotated[list[int], Field(max_length=2)]
 
     @property
@@ -117,8 +126,38 @@ def times(
             return Film.model_validate(found), ticks, int(last[0])
 
 
+def full_scale(film: Film, shown: Signatures) -> float:
+    """The light that frames of a film are to have at full scale, 1 for white: more if HDR shows the monitor brighter.
+
+    Parameters
+    ----------
+    film : Film
+    shown : (frames, rows, columns, 3) uint8
+        The signatures of frames of the patterns.
+
+    Notes
+    -----
+    Films for HDR displays have room for highlights. A camera whose exposure is set by a dark room puts the monitor
+    there, where nothing of it is lost. A lamp, which is no darker when the monitor is black, does not count.
+    """
+    if not is_hdr(film.transfer):
+        return 1.0
+    light = light_of_hdr(film.transfer)
+    brightest, darkest = (
+        light[codes.astype(np.intp) * 257] for codes in (shown.max(axis=0), shown.min(axis=0))
+    )
+    of_monitor = brightest[darkest < brightest / 2]
+    return float(np.clip(HEADROOM * of_monitor.max(initial=0), 1, light[-1]))
+
+
 def means(
-    decoder: Decoder, file: BinaryIO, entry: str, plan: Sequence[Sequence[Share]], width: int, height: int
+    decoder: Decoder,
+    file: BinaryIO,
+    entry: str,
+    plan: Sequence[Sequence[Share]],
+    width: int,
+    height: int,
+    full: float = 1.0,
 ) -> Iterator[NDArray[np.uint16]]:
     """Weighted means of frames, see `workflows.ingest.video.frame_means.mean_frames`.
 
@@ -126,6 +165,8 @@ def means(
     ----------
     width, height : int
         Size of the frames, upright.
+    full : float
+        The light of HDR that becomes full scale.
 
     Raises
     ------
@@ -133,7 +174,7 @@ def means(
         If a frame can't be decoded again.
     """
     with blaming(entry, decoder):
-        answers = decoder.run(_means, file, entry=entry, memory=decoder.image, plan=plan)
+        answers = decoder.run(_means, file, entry=entry, memory=decoder.image, plan=plan, full=full)
         for _ in plan:
             with decoder.checking():
                 mean = next(answers, None)
@@ -191,10 +232,10 @@ def _times(
 
 
 def _means(
-    file: BinaryIO, entry: str, memory: int, plan: list[list[list[int]]]
+    file: BinaryIO, entry: str, memory: int, plan: list[list[list[int]]], full: float
 ) -> Iterator[NDArray[np.uint16]]:
     with open_clip(file, entry, memory) as clip:
-        yield from mean_frames(clip, [[Share(*share) for share in shares] for shares in plan])
+        yield from mean_frames(clip, [[Share(*share) for share in shares] for shares in plan], full)
 
 
 def _film(clip: Clip, ticks: NDArray[np.int64]) -> dict[str, Any]:
@@ -206,5 +247,6 @@ def _film(clip: Clip, ticks: NDArray[np.int64]) -> dict[str, Any]:
         "denominator": clip.time_base.denominator,
         "stated_duration": max(clip.stated_duration, 0.0),
         "interlaced": clip.interlaced,
+        "transfer": clip.transfer,
         "lost": [lost[0], lost[-1]] if lost else [],
     }

@@ -183,7 +183,11 @@ def _examine_film(
     )
     frames = len(filmed.shares)
     attributes = {"patterns": list(filmed.shares), "exposures": [1.0] * frames, "video": filmed.record}
-    storage = stills.Storage(np.dtype(np.uint16), 0, 1.0, True)
+    numbers, sent = program.constants
+    coloured = set(numbers[np.ptp(sent, axis=1) > 0].tolist())  # their colours spill into white beside them
+    shown = [share.tick for number, some in filmed.shares.items() if number not in coloured for share in some]
+    full = films.full_scale(film, signatures[np.searchsorted(ticks, np.unique(shown))])
+    storage = stills.Storage(np.dtype(np.uint16), 0, full, True)
     return _Frames((frames, film.height, film.width, 3), storage, attributes, filmed.table, filmed.notes)
 
 
@@ -298,8 +302,9 @@ def _pixels(
     if video is not None:
         shares = stack.shares()
         plan = [[Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in range(first, last)]
+        full = stack.attributes["storage"]["full"]
         with archive.open(video.file) as file:
-            yield from films.means(decoder, file, video.file, plan, stack.width, stack.height)
+            yield from films.means(decoder, file, video.file, plan, stack.width, stack.height, full)
         return
     shape = (stack.height, stack.width, stack.channels)
     storage = stills.Storage(stack.dtype, **stack.attributes["storage"])

@@ -3,6 +3,7 @@
 import io
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import av
@@ -12,7 +13,10 @@ from numpy.typing import NDArray
 
 from storage.errors import CaptureError, Unavailable
 from tests.workflows.composite.video.test_steps import clip, even, pictures
+from tests.workflows.ingest.video.camera import film as filmed_by
 from tests.workflows.ingest.video.camera import fragmented, overstated
+from tests.workflows.ingest.video.films import CAMERA, IngestFilm, error_of
+from workflows.images.hdr import HLG, light_of_hdr
 from workflows.ingest import films
 from workflows.ingest.video.decoder import open_clip
 from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
@@ -59,6 +63,38 @@ def test_means_of_another_size_end_the_decoder(decoder: Decoder) -> None:
     with pytest.raises(Unavailable, match=r"film\.mp4 ended"):
         list(films.means(decoder, io.BytesIO(FILM), "film.mp4", plan, 7, 7))
     assert decoder.has_ended
+
+
+@pytest.mark.parametrize("white", [0.5, 3.0])
+def test_monitor_brighter_than_the_white_of_hdr_is_not_clipped(
+    ingest_film: IngestFilm, light: list[NDArray[np.float32]], white: float
+) -> None:
+    filmed = filmed_by(light, replace(CAMERA, codec="libx265", hlg=white))
+    stack = ingest_film(filmed.data)
+    full = stack.attributes["storage"]["full"]
+    assert full == pytest.approx(max(1.1 * white * np.max(light), 1), rel=0.1)
+    assert (stack.read() == 65535).mean() < 0.001
+    scaled = replace(filmed, light=[white / full * one for one in light])
+    assert error_of(stack, scaled) < 6
+
+
+def test_only_what_the_monitor_lights_sets_full_scale() -> None:
+    film = films.Film(
+        width=2,
+        height=1,
+        numerator=1,
+        denominator=30,
+        stated_duration=1,
+        interlaced=False,
+        transfer=HLG,
+        lost=[],
+    )
+    shown = np.zeros((2, 1, 2, 3), np.uint8)
+    shown[:, 0, 0], shown[1, 0, 1] = 255, round(0.9 * 255)  # a lamp, and the monitor
+    assert films.full_scale(film, shown) == pytest.approx(
+        1.1 * light_of_hdr(HLG)[round(0.9 * 65535)], rel=0.02
+    )
+    assert films.full_scale(film.model_copy(update={"transfer": 1}), shown) == 1
 
 
 SIGNATURES, TICKS, GREY, FRAMES = range(1, 5)

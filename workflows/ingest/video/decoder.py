@@ -53,6 +53,8 @@ class Clip:
         Width and height as stored, before rotation.
     quarter_turns : int
         Counterclockwise quarter turns from a stored frame to an upright one.
+    transfer : int
+        Transfer characteristics of the first frame (ITU-T H.273, table 3).
     lost : list of int
         Times, in ticks, of the frames that could not be decoded, as far as the video has been read.
     interlaced : bool
@@ -99,7 +101,7 @@ class Clip:
                     entry=entry,
                 )
             self._from_start = chain([first], frames)
-            self._first = tick_of(first)
+            self._first, self.transfer = tick_of(first), int(first.color_trc)
             self.quarter_turns = round(first.rotation / 90) % 4
         except BaseException:
             self._container.close()

@@ -39,7 +39,9 @@ class Share(NamedTuple):
     weight: int
 
 
-def mean_frames(clip: Clip, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray[np.uint16]]:
+def mean_frames(
+    clip: Clip, plan: Sequence[Sequence[Share]], full: float = 1.0
+) -> Iterator[NDArray[np.uint16]]:
     """Weighted means of frames, averaged in the colour system of the video and then converted to RGB, from HDR to sRGB.
 
     Parameters
@@ -47,6 +49,8 @@ def mean_frames(clip: Clip, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray
     clip : Clip
     plan : sequence of sequences of Share
         The frames of each mean, in the order of time; weights add up to `TOTAL_WEIGHT`.
+    full : float
+        The light of HDR that becomes full scale, see `workflows.images.hdr.to_srgb`.
 
     Yields
     ------
@@ -81,7 +85,7 @@ def mean_frames(clip: Clip, plan: Sequence[Sequence[Share]]) -> Iterator[NDArray
                 total += np.multiply(plane, weight, dtype=total.dtype)
         rgb = _to_rgb(sums, seen)
         if is_hdr(seen.color_trc):
-            rgb = to_srgb(rgb, seen.color_trc, seen.color_primaries)
+            rgb = to_srgb(rgb, seen.color_trc, seen.color_primaries, full)
         yield np.ascontiguousarray(np.rot90(rgb, clip.quarter_turns))
 
 

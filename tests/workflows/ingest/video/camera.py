@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.parts.captures import zip_bytes
+from workflows.images import hdr
 from workflows.images.tone_curves import from_light, to_light
 from workflows.programs.program import Program
 from workflows.simulation.scene import Scene
@@ -26,7 +27,10 @@ CODECS = {
 
 @dataclass(frozen=True)
 class Camera:
-    """How a program is shown and filmed: times in seconds; ``exposure`` in frames, ``readout`` of all rows."""
+    """How a program is shown and filmed: times in seconds; ``exposure`` in frames, ``readout`` of all rows.
+
+    ``hlg`` is the light of full scale in a film for HDR displays, 1 for their white; 0 is a film in sRGB.
+    """
 
     fps: float = 30
     hold: float = 0.3
@@ -38,6 +42,7 @@ class Camera:
     uneven: float = 0.0
     idle: float = 0.35
     codec: str = "libx264"
+    hlg: float = 0.0
     container: str = "mp4"
     seed: int = 0
     hand: tuple[float, float] = (0, 0)
@@ -89,6 +94,8 @@ def film(light: Sequence[Floats], camera: Camera) -> Film:
         stream = box.add_stream(camera.codec, rate=Fraction(camera.fps).limit_denominator(1000))
         stream.width, stream.height = width, height
         stream.pix_fmt = "yuvj420p" if camera.codec == "mjpeg" else "yuv420p"
+        if camera.hlg:
+            stream.pix_fmt, stream.codec_context.color_trc = "yuv420p10le", hdr.HLG
         stream.options = CODECS[camera.codec] | camera.options
         base = Fraction(1, TICK) if camera.container != "avi" else Fraction(1 / Fraction(camera.fps))
         stream.codec_context.time_base = base
@@ -106,8 +113,7 @@ def film(light: Sequence[Floats], camera: Camera) -> Film:
                 left, right = np.clip([across, across + width / 2], 0, width).astype(int)
                 picture[height // 4 :, left:right] = 0.15 + 0.1 * np.sin(np.arange(right - left))[:, None]
             noise = (0.002 + 0.006 * np.sqrt(picture)) * random.standard_normal(picture.shape, np.float32)
-            code = np.round(from_light(np.clip(picture + noise, 0, 1), "srgb") * 255).astype(np.uint8)
-            frame = av.VideoFrame.from_ndarray(code, format="rgb24")
+            frame = _coded(picture + noise, camera)
             gone = camera.cut[1] - camera.cut[0] if time >= camera.cut[1] > 0 else 0
             frame.pts = round((time - times[0] - gone) / base) if camera.container != "avi" else number
             frame.time_base = base
@@ -117,6 +123,16 @@ def film(light: Sequence[Floats], camera: Camera) -> Film:
         for packet in stream.encode():
             box.mux(packet)
     return Film(target.getvalue(), starts - times[0], shown, list(light))
+
+
+def _coded(light: Floats, camera: Camera) -> av.VideoFrame:
+    """A frame of light from 0 to 1."""
+    if camera.hlg:
+        of_codes = hdr.light_of_hdr(hdr.HLG)
+        code = np.searchsorted(of_codes, np.clip(camera.hlg * light, 0, of_codes[-1])).astype(np.uint16)
+        return av.VideoFrame.from_ndarray(code, format="rgb48le")
+    code = np.round(from_light(np.clip(light, 0, 1), "srgb") * 255).astype(np.uint8)
+    return av.VideoFrame.from_ndarray(code, format="rgb24")
 
 
 def capture(
