@@ -29,6 +29,8 @@ BACK = (0, 2, 10, 60)
 """Seconds before a time at which reading begins to find it. A transport stream has no index, and is entered anywhere:
 nothing can be decoded up to the next key frame."""
 _HEAD = 12  # bytes that tell HEIC
+UNSTATED = 2
+"""A transfer, primaries or a colour system that is not stated (ITU-T H.273, tables 2 to 4)."""
 
 
 class Clip:
@@ -90,6 +92,7 @@ class Clip:
             ) from error
         try:
             self._stream = self._open()
+            self._stated = _colours(self._stream.codec_context)
             self.size = self._stream.codec_context.width, self._stream.codec_context.height
             frames = self._frames()
             first = next(frames, None)
@@ -243,9 +246,15 @@ class Clip:
                 intact = not frame.is_corrupt and (intact or frame.key_frame)
                 if intact:
                     self.interlaced |= bool(frame.interlaced_frame)
+                    self._colour(frame)
                     yield frame
                 elif frame.pts is not None:
                     self.lost.append(frame.pts)
+
+    def _colour(self, frame: VideoFrame) -> None:
+        """Give a frame without colours of its own those that the container states: of HEVC, FFmpeg forgets them."""
+        if {*_colours(frame)[:3]} == {UNSTATED}:
+            frame.color_trc, frame.color_primaries, frame.colorspace, frame.color_range = self._stated
 
     def _check_size(self, width: int, height: int) -> None:
         if 6 * width * height > self._limit:
@@ -266,6 +275,11 @@ def tick_of(frame: VideoFrame) -> int:
     """When a frame of a `Clip` is shown, in ticks."""
     assert frame.pts is not None  # Clip yields no other
     return frame.pts
+
+
+def _colours(of: Any) -> tuple[int, int, int, int]:
+    """The transfer, the primaries, the colour system and the range of a frame, or of a codec."""
+    return of.color_trc, of.color_primaries, of.colorspace, of.color_range
 
 
 def _refuse(url: str, *_: object) -> BinaryIO:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from storage.errors import CaptureError
 from workflows.images.hdr import is_hdr, to_srgb
-from workflows.ingest.video.decoder import Clip, tick_of
+from workflows.ingest.video.decoder import UNSTATED, Clip, tick_of
 
 PLANAR = {
     "gray": "gray16le",
@@ -24,8 +24,6 @@ PLANAR = {
 """Pixel formats whose planes are averaged as they are, and the same formats with 16 bits a value."""
 ACCURATE = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 """Without these flags, swscale makes colours half a code too dark."""
-UNSTATED = 2
-"""A colour system that is not stated (ITU-T H.273, table 4)."""
 SD_ROWS = 576
 """Pictures with more rows are by BT.709 if nothing else is stated, others by BT.601, as in players."""
 TOTAL_WEIGHT = 257

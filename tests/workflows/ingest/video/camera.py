@@ -1,6 +1,7 @@
 """A camera that films a monitor without being synchronised with it, and the truth about its frames."""
 
 import io
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -152,6 +153,19 @@ def turned(video: bytes, matrix: Sequence[int]) -> bytes:
     """An MP4 whose track has another display matrix (ISO/IEC 14496-12, sect. 8.3.2): what turns it upright."""
     at = video.index(b"tkhd") + 4 + 40
     return video[:at] + np.array(matrix, ">i4").tobytes() + video[at + 36 :]
+
+
+def stated_by_container(video: bytes, *colours: int, full: bool = False) -> bytes:
+    """A MOV of HEVC with a box of its colours: primaries, transfer and matrix (ISO/IEC 14496-12, sect. 12.1.5)."""
+    box = struct.pack(">I4s4sHHHB", 19, b"colr", b"nclx", *colours, full << 7)
+    made = bytearray(video)
+    entry = made.index(b"hvc1") - 4
+    end = entry + int.from_bytes(made[entry : entry + 4], "big")
+    made[end:end] = box
+    for kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"hvc1"):
+        at = made.index(kind) - 4
+        made[at : at + 4] = (int.from_bytes(made[at : at + 4], "big") + len(box)).to_bytes(4, "big")
+    return bytes(made)
 
 
 def as_transport_stream(video: bytes, packet: int = 188) -> bytes:

@@ -7,9 +7,9 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from av.video.reformatter import Colorspace
+from av.video.reformatter import ColorRange, Colorspace
 
-from tests.workflows.ingest.video.camera import interlaced
+from tests.workflows.ingest.video.camera import interlaced, stated_by_container
 from workflows.images import hdr
 from workflows.ingest.video.decoder import Clip
 from workflows.ingest.video.frame_means import ACCURATE, TOTAL_WEIGHT, Share, mean_frames
@@ -102,3 +102,34 @@ def test_colour_system_that_is_not_stated_follows_from_the_size(height: int, sys
     with closing(Clip(io.BytesIO(target.getvalue()), "clip", 1 << 24)) as film:
         (mean,) = mean_frames(film, [[Share(0, TOTAL_WEIGHT)]])
     assert np.abs(mean / 257 - picture).max() < 2
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_colours_that_only_the_container_states_are_those_of_the_film(full: bool) -> None:
+    picture = np.full((48, 64, 3), (40_000, 30_000, 20_000), np.uint16)
+    means = []
+    for stated in (True, False):
+        target = io.BytesIO()
+        with av.open(target, "w", format="mov") as box:
+            stream = box.add_stream("libx265", rate=30, options={"x265-params": "log-level=none"})
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p10le"
+            coded: Any = stream.codec_context
+            coded.codec_tag = "hvc1"
+            frame = av.VideoFrame.from_ndarray(picture, "rgb48le").reformat(format="yuv420p10le")
+            if stated:
+                colours = (
+                    hdr.HLG,
+                    hdr.BT_2020,
+                    Colorspace.BT2020,
+                    ColorRange.JPEG if full else ColorRange.MPEG,
+                )
+                for one in (coded, frame):
+                    one.color_trc, one.color_primaries, one.colorspace, one.color_range = colours
+            box.mux(stream.encode(frame))
+            box.mux(stream.encode())
+        data = target.getvalue()
+        data = data if stated else stated_by_container(data, hdr.BT_2020, hdr.HLG, 9, full=full)
+        with closing(Clip(io.BytesIO(data), "clip", 1 << 24)) as film:
+            assert film.transfer == hdr.HLG
+            means += mean_frames(film, [[Share(0, TOTAL_WEIGHT)]])
+    np.testing.assert_array_equal(*means)
