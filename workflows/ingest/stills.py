@@ -153,7 +153,7 @@ def storage_of(decoder: Decoder, archive: CaptureArchive, first: NDArray[np.gene
             entry=MANIFEST,
             field="response",
         )
-    numbers, sent = manifest.program.constants
+    numbers, sent = manifest.program.constants_among([frame.pattern for frame in manifest.frames])
     white = int(numbers[np.argmax(sent.sum(axis=1))])
     frames = [frame for frame in manifest.frames if frame.pattern == white]
     entry = max(frames, key=lambda frame: frame.exposure).file

@@ -192,3 +192,13 @@ def test_a_jpeg_with_the_name_of_raw_is_refused_with_a_remedy(make_zip: Zip, ing
     jpeg = encode_jpeg(np.ones((HEIGHT, WIDTH, 3), np.uint8), 90)
     with pytest.raises(CaptureError, match=r"^0\.nef: this is a JPEG .* rename it to \.jpg"):
         ingest("c", make_zip(record("nef"), {f"{n}.nef": jpeg for n in range(6)}))
+
+
+def test_full_scale_of_an_unfinished_capture_is_that_of_the_brightest_frame_there_is(
+    make_zip: Zip, ingest: Ingest
+) -> None:
+    frames, given = light(1.0), record("exr", unfinished=True)
+    given["frames"] = [frame for frame in given["frames"] if frame["pattern"] != 2]
+    files = {f"{n}.exr": exr(f) for n, f in enumerate(frames) if n != 2}
+    stack = ingest("c", make_zip(given, files))
+    assert stack.attributes["storage"]["full"] == pytest.approx(1.05 * frames[1].max())
