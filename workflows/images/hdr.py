@@ -27,9 +27,32 @@ BAND = 1 << 18
 TOP = 65535
 
 
+HEADROOM = 1.1
+"""Full scale relative to the brightest of a monitor: leaves room for noise and for what compression overshoots."""
+
+
 def is_hdr(transfer: int) -> bool:
     """Whether these transfer characteristics are for HDR displays."""
     return transfer in (PQ, HLG)
+
+
+def full_scale(transfer: int, brightest: NDArray[np.float32], darkest: NDArray[np.float32]) -> float:
+    """The light that a capture's frames are to have at full scale: more than white if they show a monitor brighter.
+
+    Parameters
+    ----------
+    transfer : int
+        `PQ` or `HLG`.
+    brightest, darkest : (...) float32
+        The light of some places at which the frames have most and least, 1 for white.
+
+    Notes
+    -----
+    A camera whose exposure is set by a dark room puts the monitor into the room for highlights, where nothing of it is
+    lost. A lamp, which is no darker when the monitor is black, does not count.
+    """
+    of_monitor = brightest[darkest < brightest / 2]
+    return float(np.clip(HEADROOM * of_monitor.max(initial=0), 1, light_of_hdr(transfer)[-1]))
 
 
 def to_srgb(

@@ -40,7 +40,19 @@ def halves_colour(data: bytes) -> bool:
     return pillow_heif.open_heif(data).info["chroma"] in (420, 422)
 
 
-def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.unsignedinteger]:
+def transfer(data: bytes) -> int:
+    """The transfer characteristics of the main picture; 0 if none are stated.
+
+    Raises
+    ------
+    ImageError
+    """
+    return int(_stated(_opened(data)).get("transfer_characteristics", 0))
+
+
+def decode(
+    data: bytes, *, memory: int, turn: int | None = None, full: float = 1.0
+) -> NDArray[np.unsignedinteger]:
     """Decode the main picture of a HEIF.
 
     Parameters
@@ -50,6 +62,8 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.u
         Bytes that the decoded picture may take; checked by the header, before anything is decoded.
     turn : int, optional
         Orientation, see `orientation.upright`; by default the file's own.
+    full : float
+        The light of HDR that becomes full scale, see `hdr.to_srgb`.
 
     Returns
     -------
@@ -64,7 +78,7 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.u
     """
     picture = _opened(data)
     name, _, depth = picture.mode.partition(";")
-    deep, stated = bool(depth), _info(picture).get("nclx_profile") or {}
+    deep, stated = bool(depth), _stated(picture)
     is_for_hdr = is_hdr(stated.get("transfer_characteristics", 0))
     check_size(
         *picture.size, (2 if deep or is_for_hdr else 1) * (1 if name in ("L", "I") else len(name)), memory
@@ -82,7 +96,7 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> NDArray[np.u
         pixels = (pixels << (16 - bits)) | (pixels >> (2 * bits - 16))
     if is_for_hdr and pixels.shape[2] == 3:
         codes = (pixels if deep else pixels * np.uint16(257)).astype(np.uint16, copy=False)
-        pixels = to_srgb(codes, stated["transfer_characteristics"], stated["color_primaries"])
+        pixels = to_srgb(codes, stated["transfer_characteristics"], stated["color_primaries"], full)
     # The library has turned it by the file's own orientation.
     if turn is not None and (own := orientation(data)) != turn:
         pixels = upright(upright(pixels, inverse(own)), turn)
@@ -143,6 +157,11 @@ def _opened(data: bytes) -> pillow_heif.HeifImage:
 
 def _info(picture: pillow_heif.HeifImage) -> dict[str, Any]:
     return dict(picture.info)
+
+
+def _stated(picture: pillow_heif.HeifImage) -> dict[str, Any]:
+    """The colours that a picture states in numbers."""
+    return _info(picture).get("nclx_profile") or {}
 
 
 def _refusal(error: Exception) -> ImageError:

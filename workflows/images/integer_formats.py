@@ -73,12 +73,21 @@ def halves_colour(data: bytes) -> bool:
         return False
 
 
+def transfer(data: bytes) -> int:
+    """The transfer characteristics of a HEIC (ITU-T H.273, table 3); 0 of other images, or if it can't be read."""
+    try:
+        return heif.transfer(data) if heif.is_heif(data) else 0
+    except ImageError:
+        return 0
+
+
 def decode(
     data: bytes,
     *,
     memory: int,
     alpha: bool = False,
     turn: int | None = None,
+    full: float = 1.0,
     formats: tuple[str, ...] = FORMATS,
 ) -> Codes:
     """Decode an image.
@@ -93,6 +102,8 @@ def decode(
         Whether to keep an alpha channel.
     turn : int, optional
         Orientation, see `upright`; by default the file's own.
+    full : float
+        The light of HEIC for HDR displays that becomes full scale, see `hdr.to_srgb`.
     formats : tuple of str
         What Pillow may open.
 
@@ -108,7 +119,7 @@ def decode(
         If it is not one of the formats, damaged, too large, or has another type or number of channels.
     """
     if heif.is_heif(data):
-        return _kept(heif.decode(data, memory=memory, turn=turn), alpha)
+        return _kept(heif.decode(data, memory=memory, turn=turn, full=full), alpha)
     if "WEBP" in formats:
         web_formats.check_webp(data, memory)
     try:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from workflows.images.hdr import is_hdr, light_of_hdr
+from workflows.images import hdr
 from workflows.ingest.video.decoder import Clip, open_clip
 from workflows.ingest.video.frame_means import Share, mean_frames
 from workflows.ingest.video.signatures import CELLS, LARGE_CELLS, LargeFrames, Signatures, take_signatures
@@ -18,11 +18,6 @@ Positive = Annotated[int, Field(ge=1)]
 THREADS = 4
 """Threads that decode a film from its first frame to its last, when no other worker can help: with two, a core of two
 waits while small copies are made, and a film of 76 s in full HD takes 13.1 s rather than 11.6."""
-
-
-HEADROOM = 1.1
-"""Full scale of a film for HDR displays, relative to the brightest part of the monitor: leaves room for noise and
-for what compression overshoots."""
 
 
 class Film(BaseModel):
@@ -127,27 +122,21 @@ def times(
 
 
 def full_scale(film: Film, shown: Signatures) -> float:
-    """The light that frames of a film are to have at full scale, 1 for white: more if HDR shows the monitor brighter.
+    """The light that frames of a film are to have at full scale, see `workflows.images.hdr.full_scale`.
 
     Parameters
     ----------
     film : Film
     shown : (frames, rows, columns, 3) uint8
         The signatures of frames of the patterns.
-
-    Notes
-    -----
-    Films for HDR displays have room for highlights. A camera whose exposure is set by a dark room puts the monitor
-    there, where nothing of it is lost. A lamp, which is no darker when the monitor is black, does not count.
     """
-    if not is_hdr(film.transfer):
+    if not hdr.is_hdr(film.transfer):
         return 1.0
-    light = light_of_hdr(film.transfer)
+    light = hdr.light_of_hdr(film.transfer)
     brightest, darkest = (
         light[codes.astype(np.intp) * 257] for codes in (shown.max(axis=0), shown.min(axis=0))
     )
-    of_monitor = brightest[darkest < brightest / 2]
-    return float(np.clip(HEADROOM * of_monitor.max(initial=0), 1, light[-1]))
+    return hdr.full_scale(film.transfer, brightest, darkest)
 
 
 def means(

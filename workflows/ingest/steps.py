@@ -151,7 +151,7 @@ def _examine_stills(decoder: Decoder, archive: CaptureArchive) -> _Frames:
         "orientation": header.orientation,
         "half_colour": header.half_colour,
     }
-    storage = stills.storage_of(decoder, archive, first)
+    storage = stills.storage_of(decoder, archive, first, header.transfer)
     return _Frames((len(frames), height, width, channels), storage, attributes, None, [])
 
 
@@ -311,7 +311,7 @@ def _pixels(
     kind = np.dtype(np.float32) if storage.black else stack.dtype
     turn = stack.attributes.get("orientation", 1)  # missing from stacks of earlier versions
     for frame in archive.manifest.frames[first:last]:
-        pixels = stills.read(decoder, archive, frame.file, turn)
+        pixels = stills.read(decoder, archive, frame.file, turn, storage.full)
         if pixels.shape != shape or pixels.dtype != kind:
             raise CaptureError(
                 f"{frame.file} is {_size(pixels)} with {pixels.shape[2]} channels of {pixels.dtype}, the first "

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from storage.errors import CaptureError, ImageError
-from workflows.images import camera_raw, float_formats, integer_formats, raw_files
+from workflows.images import camera_raw, float_formats, hdr, integer_formats, raw_files
 from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
-from workflows.images.tone_curves import BLACK
+from workflows.images.tone_curves import BLACK, table
 from workflows.ingest.archive import CaptureArchive
-from workflows.ingest.manifest import MANIFEST
+from workflows.ingest.manifest import MANIFEST, Manifest
 from workflows.untrusted.decoder import Decoder, blaming
 
 HEADROOM = 1.05
@@ -22,6 +22,9 @@ HEADROOM = 1.05
 HIGHLIGHT = 4.0
 """The largest value that full scale makes room for, relative to the white frame's 99th percentile: a glint must not
 cost precision."""
+
+LOOKED_AT = 1 << 20
+"""Pixels of HDR, spread over the frame, that its full scale is found from."""
 
 
 class Storage(NamedTuple):
@@ -72,6 +75,8 @@ class Header(BaseModel):
         For `workflows.images.orientation.upright`.
     half_colour : bool
         Whether it stores colour at half the resolution, as most JPEG and HEIC do.
+    transfer : int
+        See `workflows.images.integer_formats.transfer`.
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
@@ -79,6 +84,7 @@ class Header(BaseModel):
     raw: bool
     orientation: Annotated[int, Field(ge=1, le=8)]
     half_colour: bool
+    transfer: Annotated[int, Field(ge=0, le=0xFFFF)]
 
 
 def header(decoder: Decoder, archive: CaptureArchive, entry: str) -> Header:
@@ -95,13 +101,17 @@ def header(decoder: Decoder, archive: CaptureArchive, entry: str) -> Header:
         return Header.model_validate(found)
 
 
-def read(decoder: Decoder, archive: CaptureArchive, entry: str, turn: int | None = None) -> Codes | Floats:
+def read(
+    decoder: Decoder, archive: CaptureArchive, entry: str, turn: int | None = None, full: float = 1.0
+) -> Codes | Floats:
     """Decode a frame: PNG, TIFF, JPEG, HEIC, EXR, Radiance HDR or camera RAW.
 
     Parameters
     ----------
     turn : int, optional
         Orientation; by default the one that the file states.
+    full : float
+        The light of HEIC for HDR displays that becomes full scale.
 
     Returns
     -------
@@ -115,7 +125,7 @@ def read(decoder: Decoder, archive: CaptureArchive, entry: str, turn: int | None
     """
     data = archive.read(entry)
     with blaming(entry, decoder):
-        return decoder.picture(_decode, data, entry=entry, memory=decoder.image, turn=turn)
+        return decoder.picture(_decode, data, entry=entry, memory=decoder.image, turn=turn, full=full)
 
 
 def read_integers(decoder: Decoder, archive: CaptureArchive, entry: str) -> Codes:
@@ -131,8 +141,10 @@ def read_integers(decoder: Decoder, archive: CaptureArchive, entry: str) -> Code
         return decoder.picture(_decode_integers, data, entry=entry, memory=decoder.image)
 
 
-def storage_of(decoder: Decoder, archive: CaptureArchive, first: NDArray[np.generic]) -> Storage:
-    """How to store the frames of an archive, given the first of them.
+def storage_of(
+    decoder: Decoder, archive: CaptureArchive, first: NDArray[np.generic], transfer: int
+) -> Storage:
+    """How to store the frames of an archive, given the first of them and its transfer characteristics.
 
     Raises
     ------
@@ -141,22 +153,21 @@ def storage_of(decoder: Decoder, archive: CaptureArchive, first: NDArray[np.gene
 
     Notes
     -----
-    Integers are stored as they are. Full scale is the white level of RAW. Other float values have no upper limit: full
-    scale is then given by the brightest constant frame, in which every pixel is at least as bright as in any pattern.
+    Integers are stored as they are, those for HDR displays as sRGB. Full scale is the white level of RAW. Other float
+    values have no upper limit: full scale is then given by the brightest constant frame, in which every pixel is at
+    least as bright as in any pattern. That of HDR is white, or more if it and the darkest show the monitor brighter.
     """
-    if first.dtype != np.float32:
-        return Storage(first.dtype, 0, 1.0, True)  # type: ignore[arg-type]
     manifest = archive.manifest
+    if first.dtype != np.float32:
+        full = _full_scale(decoder, archive, first, transfer) if hdr.is_hdr(transfer) else 1.0
+        return Storage(first.dtype, 0, full, True)  # type: ignore[arg-type]
     if manifest.response not in ("linear", "unknown"):
         raise CaptureError(
             'RAW, EXR and float TIFF frames hold linear light: set "response": "linear"',
             entry=MANIFEST,
             field="response",
         )
-    numbers, sent = manifest.program.constants_among([frame.pattern for frame in manifest.frames])
-    white = int(numbers[np.argmax(sent.sum(axis=1))])
-    frames = [frame for frame in manifest.frames if frame.pattern == white]
-    entry = max(frames, key=lambda frame: frame.exposure).file
+    entry = _constants(manifest)[1]
     full, bounded = 1.0, header(decoder, archive, entry).raw
     if not bounded:
         values = read(decoder, archive, entry)
@@ -171,6 +182,32 @@ def storage_of(decoder: Decoder, archive: CaptureArchive, first: NDArray[np.gene
     return Storage(np.dtype(np.uint16), BLACK, full, bounded)
 
 
+def _constants(manifest: Manifest) -> tuple[str, str]:
+    """The frames of the darkest and of the brightest constant pattern, each in its longest exposure."""
+    numbers, sent = manifest.program.constants_among([frame.pattern for frame in manifest.frames])
+    levels = sent.sum(axis=1)
+
+    def longest(pattern: int) -> str:
+        frames = [frame for frame in manifest.frames if frame.pattern == pattern]
+        return max(frames, key=lambda frame: frame.exposure).file
+
+    return longest(int(numbers[np.argmin(levels)])), longest(int(numbers[np.argmax(levels)]))
+
+
+def _full_scale(
+    decoder: Decoder, archive: CaptureArchive, first: NDArray[np.generic], transfer: int
+) -> float:
+    """The light that HEICs for HDR displays are to have at full scale, see `workflows.images.hdr.full_scale`."""
+    most = float(hdr.light_of_hdr(transfer)[-1])
+    frames = [read(decoder, archive, entry, full=most) for entry in _constants(archive.manifest)]
+    if any(frame.dtype != np.uint16 or frame.shape != first.shape for frame in frames):
+        return 1.0  # refused when they are read to be stored
+    look_up = most * table("srgb", np.dtype(np.uint16))
+    step = -(-first.shape[0] * first.shape[1] // LOOKED_AT)
+    darkest, brightest = (look_up[frame.reshape(-1, frame.shape[2])[::step]] for frame in frames)
+    return hdr.full_scale(transfer, brightest, darkest)
+
+
 # What follows runs in a decoder.
 
 
@@ -178,10 +215,17 @@ def _header(file: BinaryIO, entry: str) -> Iterator[dict[str, Any]]:
     data = file.read()
     raw = raw_files.is_raw(data, entry)
     turn = camera_raw.orientation(data) if raw else integer_formats.orientation(data)
-    yield {"raw": raw, "orientation": turn, "half_colour": not raw and integer_formats.halves_colour(data)}
+    yield {
+        "raw": raw,
+        "orientation": turn,
+        "half_colour": not raw and integer_formats.halves_colour(data),
+        "transfer": 0 if raw else integer_formats.transfer(data),
+    }
 
 
-def _decode(file: BinaryIO, entry: str, memory: int, turn: int | None) -> Iterator[Codes | Floats]:
+def _decode(
+    file: BinaryIO, entry: str, memory: int, turn: int | None, full: float
+) -> Iterator[Codes | Floats]:
     data = file.read()
     with _naming(entry):
         if raw_files.is_raw(data, entry):
@@ -189,7 +233,7 @@ def _decode(file: BinaryIO, entry: str, memory: int, turn: int | None) -> Iterat
         elif float_formats.is_float(data):
             yield float_formats.decode(data, memory=memory, turn=turn)
         else:
-            yield integer_formats.decode(data, memory=memory, turn=turn)
+            yield integer_formats.decode(data, memory=memory, turn=turn, full=full)
 
 
 def _decode_integers(file: BinaryIO, entry: str, memory: int) -> Iterator[Codes]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from storage.errors import CaptureError
 from storage.layout.captures import Stack
 from tests.parts.inputs.heics import heic
+from workflows.images import hdr
 from workflows.images.integer_formats import encode_jpeg, encode_png
 from workflows.images.tone_curves import BLACK, table
 from workflows.ingest.report.report import report
@@ -202,3 +203,18 @@ def test_full_scale_of_an_unfinished_capture_is_that_of_the_brightest_frame_ther
     files = {f"{n}.exr": exr(f) for n, f in enumerate(frames) if n != 2}
     stack = ingest("c", make_zip(given, files))
     assert stack.attributes["storage"]["full"] == pytest.approx(1.05 * frames[1].max())
+
+
+@pytest.mark.parametrize("white", [0.5, 2.5])
+def test_monitor_brighter_than_the_white_of_hdr_is_not_clipped(
+    make_zip: Zip, ingest: Ingest, white: float
+) -> None:
+    frames = light(1.0, noise=0)
+    codes = np.searchsorted(hdr.light_of_hdr(hdr.HLG), white * frames) // 64
+    stated = {"color_primaries": hdr.BT_2020, "transfer_characteristics": hdr.HLG}
+    files = {f"{n}.heic": heic(c.astype(np.uint16), **stated) for n, c in enumerate(codes)}
+    stack = ingest("c", make_zip(record("heic", response="srgb"), files))
+    srgb = np.clip(white * frames @ hdr.TO_SRGB.T, 0, None)
+    full = stack.attributes["storage"]["full"]
+    assert full == pytest.approx(max(1.1 * srgb[2].max(), 1), rel=0.02)
+    np.testing.assert_allclose(decoded(stack), srgb, atol=0.01 * white)
