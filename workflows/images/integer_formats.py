@@ -1,6 +1,7 @@
 """PNG, JPEG, TIFF, HEIC and web formats of 8 to 16 bits to arrays, and PNG and JPEG back. Files are not trusted."""
 
 import io
+import re
 from contextlib import suppress
 from typing import IO, cast
 
@@ -35,7 +36,11 @@ LOSSLESS = {
 PLAIN = {tifffile.PHOTOMETRIC.MINISWHITE, tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB}
 """Photometric interpretations of a TIFF whose values are used as they are."""
 SAVE_IT = "save it as grey or RGB with 8 or 16 bits a channel"
-START_OF_SCAN = b"\xff\xda"
+MARKER = re.compile(rb"\xff([\x02-\xcf\xd9-\xfe])")
+"""A marker of a JPEG other than those that stand alone, of which a scan may hold some (ITU-T T.81, table B.1)."""
+END, SCAN = b"\xd9", b"\xda"
+SEGMENTS = 10_000
+"""Segments of a JPEG that are looked at: those of cameras have some dozens."""
 SCANS = 100
 """Scans of a JPEG: each takes as long as a picture, but only a few bytes. Encoders write about ten."""
 
@@ -128,7 +133,7 @@ def decode(
         raise ImageError(_not_opened(data, formats)) from error
     if picture.format == "PNG" and getattr(picture, "is_animated", False):
         raise ImageError("this PNG is animated: save a single picture")
-    if picture.format in ("JPEG", "MPO") and data.count(START_OF_SCAN) > SCANS:
+    if picture.format in ("JPEG", "MPO") and _scans(data) > SCANS:
         raise ImageError(f"this JPEG has more than {SCANS} scans: save it again", limit=SCANS)
     own = _orientation_of(picture)  # read first, because decoding removes it from a TIFF
     try:
@@ -156,6 +161,18 @@ def _not_opened(data: bytes, formats: tuple[str, ...]) -> str:
         f"this is not a {', '.join(formats)} or HEIC image, or it is cut off: copy it again from the camera, or "
         "save it as PNG"
     )
+
+
+def _scans(data: bytes) -> int:
+    """The scans of a JPEG. What follows its end does not count: phones append films of several megabytes."""
+    at = scans = 0
+    for _ in range(SEGMENTS):
+        found = MARKER.search(data, at)
+        if not found or found[1] == END:
+            return scans
+        scans += found[1] == SCAN
+        at = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
+    return SCANS + 1
 
 
 def _kept(pixels: NDArray[np.generic], alpha: bool) -> Codes:

@@ -16,7 +16,14 @@ from PIL import Image
 
 from storage.errors import ImageError
 from tests.parts.inputs.heics import heic
-from workflows.images.integer_formats import decode, encode_png, halves_colour, to_integers, to_unit
+from workflows.images.integer_formats import (
+    decode,
+    encode_jpeg,
+    encode_png,
+    halves_colour,
+    to_integers,
+    to_unit,
+)
 
 MEMORY = 1 << 20
 
@@ -352,6 +359,15 @@ def test_a_jpeg_of_many_scans_is_refused() -> None:
     scan = data[data.rindex(b"\xff\xda") : -2]
     with pytest.raises(ImageError, match="100 scans"):
         decode(data[:-2] + scan * 100 + data[-2:], memory=MEMORY)
+
+
+def test_film_behind_a_jpeg_is_not_taken_for_scans() -> None:
+    """Phones append what they filmed before the picture: in ten megabytes some bytes look like scans."""
+    pixels = np.random.default_rng(3).integers(0, 256, (64, 64, 3), np.uint8)
+    still = encode_jpeg(pixels, 95)
+    np.testing.assert_array_equal(
+        decode(still + b"mpv2" + b"\xff\xda" * 101, memory=MEMORY), decode(still, memory=MEMORY)
+    )
 
 
 def test_units_and_integers() -> None:
