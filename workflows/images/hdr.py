@@ -29,6 +29,8 @@ TOP = 65535
 
 HEADROOM = 1.1
 """Full scale relative to the brightest of a monitor: leaves room for noise and for what compression overshoots."""
+ALL_BUT_OVERSHOOTS = 99.9
+"""The percentile that is the brightest: compression makes single values up to a quarter too bright."""
 
 
 def is_hdr(transfer: int) -> bool:
@@ -52,7 +54,8 @@ def full_scale(transfer: int, brightest: NDArray[np.float32], darkest: NDArray[n
     lost. A lamp, which is no darker when the monitor is black, does not count.
     """
     of_monitor = brightest[darkest < brightest / 2]
-    return float(np.clip(HEADROOM * of_monitor.max(initial=0), 1, light_of_hdr(transfer)[-1]))
+    peak = float(np.percentile(of_monitor, ALL_BUT_OVERSHOOTS)) if of_monitor.size else 0.0
+    return float(np.clip(HEADROOM * peak, 1, light_of_hdr(transfer)[-1]))
 
 
 def to_srgb(

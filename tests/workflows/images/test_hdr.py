@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from workflows.images.hdr import BT_2020, HLG, PQ, to_srgb
+from workflows.images.hdr import BT_2020, HLG, PQ, full_scale, to_srgb
 from workflows.images.tone_curves import to_light
 
 PRIMARIES = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
@@ -48,3 +48,12 @@ def test_colours_have_the_primaries_of_srgb() -> None:
     )
     seen = to_srgb(np.rint(code * 65535).astype(np.uint16), HLG, BT_2020)
     np.testing.assert_allclose(to_light(seen / np.float32(65535), "srgb"), light, atol=2e-3)
+
+
+def test_full_scale_leaves_out_lamps_and_what_compression_overshoots() -> None:
+    brightest, darkest = np.full((4000, 1), 2, np.float32), np.zeros((4000, 1), np.float32)
+    brightest[:3] = 2.6
+    brightest[3:9], darkest[3:9] = 3.5, 3.4
+    assert full_scale(HLG, brightest, darkest) == pytest.approx(2.2)
+    assert full_scale(HLG, brightest / 4, darkest) == 1
+    assert full_scale(HLG, 2 * brightest, darkest) == pytest.approx(1 / 0.26496, rel=1e-3)
