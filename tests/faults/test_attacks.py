@@ -34,7 +34,8 @@ from tests.parts.processes import running
 from tests.parts.waiting import until
 from workflows.images.integer_formats import encode_png
 from workflows.kernels import use_matte
-from workflows.programs.program import Constant, Program
+from workflows.programs.parts import Constant
+from workflows.programs.program import Program
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.images.integer_formats import encode_png
-from workflows.programs.program import Bernoulli, Constant, Monitor, Program
+from workflows.programs.parts import Bernoulli, Constant, Monitor
+from workflows.programs.program import Program
 
 
 def nested_program(

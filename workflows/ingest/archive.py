@@ -11,7 +11,7 @@ import numpy as np
 
 from storage.errors import CaptureError
 from workflows.ingest.manifest import MANIFEST, MANIFEST_BYTES, Manifest, parse_manifest
-from workflows.programs.program import Images
+from workflows.programs.parts import Images
 from workflows.untrusted import zip_files
 from workflows.untrusted.limits import MAX_FRAMES, Limits
 

@@ -30,7 +30,7 @@ from workflows.ingest.video.frame_means import Share
 from workflows.ingest.video.matching import MAX_MATCHED, match_frames
 from workflows.ingest.video.resemblance import lay_out
 from workflows.jobs import Steps, Task
-from workflows.programs.program import Images
+from workflows.programs.parts import Images
 from workflows.untrusted.decoder import Decoder
 from workflows.untrusted.limits import Limits
 

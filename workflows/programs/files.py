@@ -17,9 +17,10 @@ from pydantic import ValidationError
 from storage.errors import OptionError
 from workflows.images.integer_formats import to_integers
 from workflows.programs.border import Border
+from workflows.programs.parts import Images
 from workflows.programs.preset_names import PRESETS
 from workflows.programs.presets import preset
-from workflows.programs.program import Images, Program
+from workflows.programs.program import Program
 from workflows.untrusted.validation import field_and_reason, reason
 
 Size = tuple[int, int]

@@ -3,8 +3,18 @@
 from typing import Literal, NamedTuple
 
 from storage.errors import OptionError
-from workflows.programs.parts import CHANNELS, MAX_BLOCKS, Colour, Part
-from workflows.programs.program import Bernoulli, Constant, Halftone, Monitor, Program, Stripes
+from workflows.programs.parts import (
+    CHANNELS,
+    MAX_BLOCKS,
+    Bernoulli,
+    Colour,
+    Constant,
+    Halftone,
+    Monitor,
+    Part,
+    Stripes,
+)
+from workflows.programs.program import Program
 
 SEED = 7
 """Seed of the first random part; each further part adds 1."""

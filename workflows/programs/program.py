@@ -24,8 +24,6 @@ from workflows.programs.parts import (
 )
 from workflows.recovery.sensing import Sensing
 
-__all__ = ["Bernoulli", "Constant", "Halftone", "Images", "Monitor", "Program", "Stripes"]
-
 Value = TypeVar("Value", bound=np.generic)
 
 MAX_PARTS = 1000

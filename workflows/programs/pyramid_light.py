@@ -10,7 +10,8 @@ from workflows.images.integer_formats import Codes, to_integers
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
 from workflows.programs.interpolation import interpolated_light
-from workflows.programs.program import Constant, Halftone, Images, Program
+from workflows.programs.parts import Constant, Halftone, Images
+from workflows.programs.program import Program
 from workflows.recovery.pyramid import Pyramid, halve_codes
 from workflows.recovery.sensing import Patterns
 

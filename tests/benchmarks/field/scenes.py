@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from tests.benchmarks.field.cameras import CAMERAS, Camera, Seen
 from tests.benchmarks.field.methods.method import Film, Floats, Matte, Method
-from workflows.programs.program import Constant, Images, Monitor, Program
+from workflows.programs.parts import Constant, Images, Monitor
+from workflows.programs.program import Program
 from workflows.simulation import camera as pinhole
 from workflows.simulation import objects
 from workflows.simulation.glass_ball import backdrop, glass_ball

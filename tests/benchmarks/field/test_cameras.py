@@ -5,7 +5,8 @@ import pytest
 import scipy.sparse as sp
 
 from tests.benchmarks.field.cameras import CAMERAS, Seen
-from workflows.programs.program import Constant, Images, Monitor, Program
+from workflows.programs.parts import Constant, Images, Monitor
+from workflows.programs.program import Program
 
 SIZE = 16, 12
 SPOT = 7 * SIZE[0] + 7

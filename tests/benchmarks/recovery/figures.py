@@ -27,8 +27,9 @@ from services.client import Client, ServiceError
 from tests.benchmarks.recovery.kits import load, parser_of, served, show
 from workflows.images import float_formats, integer_formats
 from workflows.programs.files import write_folder
+from workflows.programs.parts import Constant, Monitor
 from workflows.programs.presets import BLACK, BLUE, GREEN, RED, WHITE, Recipe, preset, stripes_and_grids
-from workflows.programs.program import Constant, Monitor, Program
+from workflows.programs.program import Program
 
 
 class Case(NamedTuple):

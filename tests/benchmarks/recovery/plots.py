@@ -26,8 +26,9 @@ from paper import sample
 from scipy.stats import spearmanr
 
 from workflows.images.resample import area_mean
+from workflows.programs.parts import Bernoulli
 from workflows.programs.presets import preset
-from workflows.programs.program import Bernoulli, Program
+from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.camera.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.lobes import recover as lobes

@@ -14,7 +14,8 @@ from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, digests, png
 from tests.parts.waiting import until
 from workflows.images import integer_formats
 from workflows.images.tone_curves import to_light
-from workflows.programs.program import Images, Program
+from workflows.programs.parts import Images
+from workflows.programs.program import Program
 from workflows.simulation.scene import Scene, write_capture
 
 

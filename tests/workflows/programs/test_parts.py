@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from tests.workflows.programs.parts import grid, program, stripes
-from workflows.programs.program import Bernoulli, Halftone, Monitor, Stripes
+from workflows.programs.parts import Bernoulli, Halftone, Monitor, Stripes
 
 
 def test_bits_are_the_raw_words_of_pcg64() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from storage.errors import OptionError
+from workflows.programs.parts import Bernoulli, Stripes
 from workflows.programs.presets import IN_GREY, RECIPES, preset
-from workflows.programs.program import Bernoulli, Stripes
 
 COUNTS = {"default": 140, "quick": 61, "sketch": 37, "paper-250": 282, "paper-400": 432}
 MONITORS = [

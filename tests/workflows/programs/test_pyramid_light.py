@@ -11,7 +11,8 @@ from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, Gamma, to_light
 from workflows.programs import pyramid_light
 from workflows.programs.interpolation import interpolated_light
-from workflows.programs.program import Bernoulli, Constant, Halftone, Images, Monitor, Program, Stripes
+from workflows.programs.parts import Bernoulli, Constant, Halftone, Images, Monitor, Stripes
+from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out, pyramid_of
 from workflows.recovery.sensing import Patterns
 

@@ -20,7 +20,8 @@ from workflows.ingest.video.matching import MIN_RESEMBLANCE
 from workflows.jobs import Task
 from workflows.programs.border import LEAD_SECONDS, Border, draw_border, schedule
 from workflows.programs.files import fit_to_screen, pictures
-from workflows.programs.program import Bernoulli, Constant, Monitor, Program
+from workflows.programs.parts import Bernoulli, Constant, Monitor
+from workflows.programs.program import Program
 from workflows.programs.video import write_video
 from workflows.untrusted.limits import Limits
 

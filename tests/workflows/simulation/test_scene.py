@@ -12,7 +12,8 @@ import pytest
 from storage.errors import OptionError
 from tests.parts.captures import nested_program
 from workflows.images.tone_curves import to_light
-from workflows.programs.program import Bernoulli, Constant, Images, Monitor, Program, Stripes
+from workflows.programs.parts import Bernoulli, Constant, Images, Monitor, Stripes
+from workflows.programs.program import Program
 from workflows.simulation.glass_ball import backdrop, glass_ball
 from workflows.simulation.scene import Scene, write_capture
 

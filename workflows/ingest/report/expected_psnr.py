@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from workflows.ingest.report.figures import Quality
-from workflows.programs.program import Bernoulli, Constant, Halftone, Program
+from workflows.programs.parts import Bernoulli, Constant, Halftone
+from workflows.programs.program import Program
 
 UNLOCKED = 0.06
 """Exposures whose standard deviation is a larger share of their mean are not those of a locked camera."""

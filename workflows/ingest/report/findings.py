@@ -17,7 +17,8 @@ from workflows.ingest.report.limits import (
     unexplained,
     unmeasured,
 )
-from workflows.programs.program import Bernoulli, Program
+from workflows.programs.parts import Bernoulli
+from workflows.programs.program import Program
 
 SURE = 4.0
 """A drift or flicker is real from so many standard errors on."""

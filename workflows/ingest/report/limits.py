@@ -7,7 +7,8 @@ import numpy as np
 
 from workflows.images.tone_curves import CameraCurve, Sampled, to_light
 from workflows.ingest.report.figures import Figures, Finding, Quality, graded
-from workflows.programs.program import Images, Program
+from workflows.programs.parts import Images
+from workflows.programs.program import Program
 
 SHOWS, SPOILS = 1e-4, 6e-3
 """Mean squares of errors, of full scale, from which on they show (40 dB), and spoil composites (22 dB)."""

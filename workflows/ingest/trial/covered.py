@@ -13,7 +13,8 @@ from workflows.ingest.trial.trial_recovery import (
     predict,
     recover_seen,
 )
-from workflows.programs.program import Bernoulli, Program
+from workflows.programs.parts import Bernoulli
+from workflows.programs.program import Program
 from workflows.recovery.sensing import Patterns
 
 OFF, UNUSUAL = 0.1, 6.0

@@ -12,7 +12,8 @@ from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.measured_light import exposures_of
 from workflows.ingest.video.resemblance import GRIDS, MIN_PATTERNS, lay_out
-from workflows.programs.program import Bernoulli, Program
+from workflows.programs.parts import Bernoulli
+from workflows.programs.program import Program
 
 PLACES = 400
 """Blocks of the frame that are compared, at most,"""

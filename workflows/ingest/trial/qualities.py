@@ -13,7 +13,8 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve
 from workflows.ingest.trial.trial_recovery import PixelSample, RecoveredSample, recover_seen, see_sample
-from workflows.programs.program import Bernoulli, Program
+from workflows.programs.parts import Bernoulli
+from workflows.programs.program import Program
 from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.interval import HELD_OUT, Interval, fit_interval, local_contrast
 from workflows.recovery.lobes.options import FAST, FINE

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
-from workflows.programs.program import Bernoulli, Constant, Halftone, Program
+from workflows.programs.parts import Bernoulli, Constant, Halftone
+from workflows.programs.program import Program
 
 Doubles = NDArray[np.float64]
 Light = NDArray[np.float32]

@@ -9,8 +9,9 @@ from tests.benchmarks.field.methods.method import Film, Floats, Matte
 from tests.benchmarks.field.methods.method import Program as Patterns
 from tests.benchmarks.recovery.solvers import Recover
 from workflows.images.resample import area_mean
+from workflows.programs.parts import Bernoulli, Constant, Monitor
 from workflows.programs.presets import preset
-from workflows.programs.program import Bernoulli, Constant, Monitor, Program
+from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.camera.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.lobes import recover as lobes

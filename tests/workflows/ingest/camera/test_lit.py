@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from storage.layout.captures import thumbnail_edge
 from workflows.images.tone_curves import from_light
 from workflows.ingest.camera.lit import find_lit, windows
-from workflows.programs.program import Bernoulli, Constant, Monitor, Program
+from workflows.programs.parts import Bernoulli, Constant, Monitor
+from workflows.programs.program import Program
 
 PROGRAM = Program(
     monitor=Monitor(width=64, height=48),

@@ -9,8 +9,9 @@ import pytest
 from tests.parts.captures import nested_program
 from workflows.ingest.report.expected_psnr import expected
 from workflows.ingest.report.figures import Quality
+from workflows.programs.parts import Constant, Monitor, Stripes
 from workflows.programs.presets import preset
-from workflows.programs.program import Constant, Monitor, Program, Stripes
+from workflows.programs.program import Program
 
 SURVEY = {"contrast": 0.81, "deviation": 0.0058}
 """Of a clear ball with usual noise."""

@@ -14,7 +14,8 @@ from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.report.expected_psnr import error_of
 from workflows.ingest.trial import unexplained
 from workflows.ingest.trial.trial_recovery import take_sample
-from workflows.programs.program import Constant, Program
+from workflows.programs.parts import Constant
+from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.camera.noise import LEAST_READ
 from workflows.recovery.glare import WIDTHS
