@@ -30,7 +30,7 @@ from workflows.untrusted import zip_files
 
 
 def make_zip(random: Random, valid: Files) -> bytes:
-    return changes.damaged_zip(random, seeds.record_files(), lambda r, name, data: changes.damaged(r, data))
+    return changes.damaged_zip(random, seeds.capture_files(), lambda r, name, data: changes.damaged(r, data))
 
 
 def read_zip(data: bytes, folder: Path) -> None:
@@ -40,11 +40,11 @@ def read_zip(data: bytes, folder: Path) -> None:
 
 
 def make_capture_archive(random: Random, valid: Files) -> bytes:
-    record = random.choice((seeds.RECORD, seeds.FILMED))
-    files = seeds.record_files(record)
+    manifest = random.choice((seeds.MANIFEST, seeds.FILMED))
+    files = seeds.capture_files(manifest)
     if random.random() < 0.3:
         return changes.damaged_zip(random, files, lambda r, name, data: changes.damaged(r, data))
-    return zip_bytes(files | {"capture.json": changes.other_json(random, record)}, zipfile.ZIP_DEFLATED)
+    return zip_bytes(files | {"capture.json": changes.other_json(random, manifest)}, zipfile.ZIP_DEFLATED)
 
 
 def read_capture_archive(data: bytes, folder: Path) -> None:
@@ -67,7 +67,7 @@ def use_program(program: Program) -> None:
 
 
 def make_program(random: Random, valid: Files) -> bytes:
-    return changes.other_json(random, seeds.RECORD["program"])
+    return changes.other_json(random, seeds.MANIFEST["program"])
 
 
 def read_program(data: bytes, folder: Path) -> None:

@@ -98,17 +98,17 @@ def make_capture(random: Random, valid: dict[str, Files]) -> bytes:
     end = random.choice([*valid, *[".mp4"] * 4])
     one = random.choice(valid[end])
     if end == ".mp4":
-        record, files = capture(PROGRAM, one, 4.0)
+        manifest, files = capture(PROGRAM, one, 4.0)
         broken = "clip.mp4"
     else:
         names = [f"{n}{end}" for n in range(11)]
         shown = [{"file": name, "pattern": n} for n, name in enumerate(names)]
-        record = seeds.RECORD | {"frames": shown, "mask": None}
+        manifest = seeds.MANIFEST | {"frames": shown, "mask": None}
         files = {"a.png": valid[".png"][0], **dict.fromkeys(names, one)}
         broken = random.choice(names)
-    text = json.dumps(record).encode()
+    text = json.dumps(manifest).encode()
     if random.random() < 0.3:
-        text = changes.other_json(random, record)
+        text = changes.other_json(random, manifest)
     else:
         files[broken] = damaged_film(random, one) if end == ".mp4" else changes.damaged(random, one)
     return zip_bytes({"capture.json": text, **files})

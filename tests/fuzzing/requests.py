@@ -66,7 +66,7 @@ BODIES: dict[str, dict[str, Any]] = {
     JSON[0]: {"capture": "c", "options": {"method": "lobes", "tile": 64}, "webhook": "https://example.org/"},
     JSON[1]: {"upload": "u", "name": "é", "webhook": "https://example.org/"},
     JSON[2]: {
-        "program": {**seeds.RECORD["program"], "parts": seeds.RECORD["program"]["parts"][:5]},
+        "program": {**seeds.MANIFEST["program"], "parts": seeds.MANIFEST["program"]["parts"][:5]},
         "monitor": {"width": 640, "height": 480},
         "border": False,
     },

@@ -23,7 +23,7 @@ Files = tuple[bytes, ...]
 PIXELS = np.random.default_rng(9).integers(0, 255, (24, 36, 3), np.uint8)
 LIGHT = (PIXELS / 255).astype(np.float32)
 COUNTS = PIXELS[:, :, 0].astype(np.uint16) * 16
-RECORD: dict[str, Any] = {
+MANIFEST: dict[str, Any] = {
     "format": "envmatte-capture/1",
     "name": "ball",
     "program": {
@@ -41,7 +41,7 @@ RECORD: dict[str, Any] = {
     "frames": [{"file": f"{n}.png", "pattern": n, "exposure": 0.5} for n in range(11)],
     "mask": "a.png",
 }
-FILMED = RECORD | {
+FILMED = MANIFEST | {
     "frames": [],
     "video": {
         "file": "0.png",
@@ -51,10 +51,10 @@ FILMED = RECORD | {
 }
 
 
-def record_files(record: dict[str, Any] = RECORD) -> dict[str, bytes]:
+def capture_files(manifest: dict[str, Any] = MANIFEST) -> dict[str, bytes]:
     """The entries of a capture archive. Its frames are no images, which its parser does not look into."""
     names = ("a.png", *(f"{n}.png" for n in range(11)))
-    return {"capture.json": json.dumps(record).encode(), **{name: name.encode() * 9 for name in names}}
+    return {"capture.json": json.dumps(manifest).encode(), **{name: name.encode() * 9 for name in names}}
 
 
 def _saved(kind: str, mode: str = "RGB", **options: Any) -> bytes:

@@ -39,10 +39,10 @@ def make_zip() -> Zip:
     """Makes a capture archive of a capture.json and files."""
 
     def make(
-        record: dict[str, Any] | bytes | None, files: dict[str, bytes], pack: int = zipfile.ZIP_STORED
+        manifest: dict[str, Any] | bytes | None, files: dict[str, bytes], pack: int = zipfile.ZIP_STORED
     ) -> bytes:
-        text = record if isinstance(record, bytes) else json.dumps(record).encode()
-        return zip_bytes({**({} if record is None else {"capture.json": text}), **files}, pack)
+        text = manifest if isinstance(manifest, bytes) else json.dumps(manifest).encode()
+        return zip_bytes({**({} if manifest is None else {"capture.json": text}), **files}, pack)
 
     return make
 

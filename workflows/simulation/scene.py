@@ -227,7 +227,7 @@ def write_capture(
     kind = "jpg" if jpeg else "png"
     frames = [{"file": f"frames/{n:05d}.{kind}", "pattern": n} for n in range(program.count)]
     masked = scene.object_mask if mask is True else mask
-    record = {
+    manifest = {
         "format": "envmatte-capture/1",
         **({"name": name} if name else {}),
         "program": program.model_dump(mode="json", exclude_defaults=True),
@@ -243,7 +243,7 @@ def write_capture(
             info.create_system = 3  # Unix, whatever the platform
             archive.writestr(info, content if isinstance(content, bytes) else imagecodecs.png_encode(content))
 
-        add("capture.json", json.dumps(record, indent=1).encode())
+        add("capture.json", json.dumps(manifest, indent=1).encode())
         for file, image in zip(files, film.get("images", ()), strict=True):
             pixels = image[:, :, 0] if image.shape[2] == 1 else image
             add(file, np.round(pixels * 65535).astype(np.uint16))

@@ -31,8 +31,8 @@ def ingest_film(make_zip: Callable[..., bytes], ingest: Callable[..., Stack]) ->
 
     def run(video: bytes, rate: float = 1 / CAMERA.hold, program: Program = PROGRAM, **more: Any) -> Stack:
         pack = {"pack": more.pop("pack")} if "pack" in more else {}
-        record, files = capture(program, video, rate)
-        record["unfinished"] = more.pop("unfinished", False)
-        return ingest("c", make_zip(record, files, **pack), **more)
+        manifest, files = capture(program, video, rate)
+        manifest["unfinished"] = more.pop("unfinished", False)
+        return ingest("c", make_zip(manifest, files, **pack), **more)
 
     return run

@@ -22,7 +22,7 @@ from workflows.untrusted.limits import MAX_FRAMES, Limits
 Zip = Callable[..., bytes]
 LIMITS = Limits(unpacked=1 << 20, memory=1 << 20)
 
-RECORD: dict[str, Any] = {
+MANIFEST: dict[str, Any] = {
     "format": "envmatte-capture/1",
     "name": "ball",
     "program": {
@@ -46,9 +46,9 @@ VIDEO = {"file": "clip.mp4", "patterns_per_second": 2.0}
 
 
 def changed(change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
-    record = copy.deepcopy(RECORD)
-    change(record)
-    return record
+    manifest = copy.deepcopy(MANIFEST)
+    change(manifest)
+    return manifest
 
 
 def open_archive(data: bytes, limits: Limits = LIMITS) -> CaptureArchive:
@@ -79,7 +79,7 @@ def test_what_is_there_in_place_of_a_capture_is_named(name: str, why: str) -> No
 
 @pytest.mark.parametrize("pack", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_archive_is_read(make_zip: Zip, pack: int) -> None:
-    archive = open_archive(make_zip(RECORD, FILES, pack))
+    archive = open_archive(make_zip(MANIFEST, FILES, pack))
     assert archive.manifest.name == "ball"
     assert archive.manifest.program.count == 5
     assert next((f.file, f.pattern) for f in archive.manifest.frames) == ("frames/2.png", 2)
@@ -88,39 +88,39 @@ def test_archive_is_read(make_zip: Zip, pack: int) -> None:
 
 
 def test_patterns_of_an_unfinished_capture_may_lack_frames(make_zip: Zip) -> None:
-    record = changed(lambda r: r.update(frames=r["frames"][:3], unfinished=True))
-    assert [frame.pattern for frame in open_archive(make_zip(record, FILES)).manifest.frames] == [2, 0, 1]
+    manifest = changed(lambda r: r.update(frames=r["frames"][:3], unfinished=True))
+    assert [frame.pattern for frame in open_archive(make_zip(manifest, FILES)).manifest.frames] == [2, 0, 1]
 
 
 def test_an_unfinished_capture_may_have_no_more_patterns_than_frames(make_zip: Zip) -> None:
-    record = changed(lambda r: r.update(frames=r["frames"][:3], unfinished=True))
-    data = make_zip(record, FILES)
+    manifest = changed(lambda r: r.update(frames=r["frames"][:3], unfinished=True))
+    data = make_zip(manifest, FILES)
     assert open_archive(data, replace(LIMITS, frames=5)).manifest.program.count == 5
     with pytest.raises(OverLimit, match="may have 4 frames or patterns, this one has 5"):
         open_archive(data, replace(LIMITS, frames=4))
 
 
 def test_unknown_fields_and_files_are_accepted(make_zip: Zip) -> None:
-    def extend(record: dict[str, Any]) -> None:
-        record["made_by"] = {"tool": "x", "at": [1, 2]}
-        record["frames"][0]["aperture"] = 5.6
-        record["program"]["note"] = "text"
-        record["program"]["monitor"]["serial"] = "7"
-        record["program"]["parts"][1]["shuffled"] = False
+    def extend(manifest: dict[str, Any]) -> None:
+        manifest["made_by"] = {"tool": "x", "at": [1, 2]}
+        manifest["frames"][0]["aperture"] = 5.6
+        manifest["program"]["note"] = "text"
+        manifest["program"]["monitor"]["serial"] = "7"
+        manifest["program"]["parts"][1]["shuffled"] = False
 
     files = FILES | {"README.txt": b"hello", "empty/": b"", "ünï.png": b""}
     archive = open_archive(make_zip(changed(extend), files))
-    assert archive.manifest == open_archive(make_zip(RECORD, FILES)).manifest
+    assert archive.manifest == open_archive(make_zip(MANIFEST, FILES)).manifest
 
 
 def test_as_many_frames_as_a_capture_may_have_fit_into_an_archive(make_zip: Zip) -> None:
     frames = [{"file": f"{n}.png", "pattern": n % 5} for n in range(MAX_FRAMES)]
-    data = make_zip(RECORD | {"frames": frames}, FILES | {frame["file"]: b"" for frame in frames})
+    data = make_zip(MANIFEST | {"frames": frames}, FILES | {frame["file"]: b"" for frame in frames})
     archive = open_archive(data, Limits(unpacked=1 << 24, memory=1 << 24))
     assert len(archive.manifest.frames) == MAX_FRAMES
 
 
-def test_archive_without_a_record_is_refused(make_zip: Zip) -> None:
+def test_archive_without_a_manifest_is_refused(make_zip: Zip) -> None:
     assert refused(make_zip(None, FILES)).fields == {"entry": "capture.json"}
     deeper = make_zip(None, {"ball/capture.json": b"{}"})
     assert refused(deeper).fields == {"entry": "capture.json"}
@@ -172,7 +172,7 @@ def test_archive_without_a_record_is_refused(make_zip: Zip) -> None:
         (lambda r: r.update(video=VIDEO | {"patterns_per_second": 0}), "video.patterns_per_second", ""),
     ],
 )
-def test_inconsistent_record_is_refused(
+def test_inconsistent_manifest_is_refused(
     make_zip: Zip, change: Callable[[dict[str, Any]], object], field: str, why: str
 ) -> None:
     error = refused(make_zip(changed(change), FILES))
@@ -182,25 +182,25 @@ def test_inconsistent_record_is_refused(
 
 
 def test_folder_as_a_frame_is_refused(make_zip: Zip) -> None:
-    record = changed(lambda r: r["frames"][0].update(file="frames/x/"))
-    error = refused(make_zip(record, FILES | {"frames/x/": b""}))
+    manifest = changed(lambda r: r["frames"][0].update(file="frames/x/"))
+    error = refused(make_zip(manifest, FILES | {"frames/x/": b""}))
     assert error.fields == {"entry": "frames/x/", "field": "frames.0.file"}
 
 
 def test_a_zip_bomb_is_refused_by_its_directory(make_zip: Zip) -> None:
-    bomb = make_zip(RECORD, FILES | {"frames/zeros.png": bytes(50 << 20)}, zipfile.ZIP_DEFLATED)
+    bomb = make_zip(MANIFEST, FILES | {"frames/zeros.png": bytes(50 << 20)}, zipfile.ZIP_DEFLATED)
     assert len(bomb) < 100_000
     start = time.process_time()
     error = refused(bomb)
     assert error.fields == {"limit": 1 << 20}
     assert time.process_time() - start < 1
     many = {f"frames/{n}.dat": bytes(1 << 17) for n in range(8)}
-    assert refused(make_zip(RECORD, FILES | many, zipfile.ZIP_DEFLATED)).fields == {"limit": 1 << 20}
+    assert refused(make_zip(MANIFEST, FILES | many, zipfile.ZIP_DEFLATED)).fields == {"limit": 1 << 20}
 
 
 def test_an_entry_takes_a_quarter_of_the_memory_at_most(make_zip: Zip) -> None:
     files = FILES | {"fits": bytes(1 << 18), "large": bytes((1 << 18) + 1)}
-    archive = open_archive(make_zip(RECORD, files))
+    archive = open_archive(make_zip(MANIFEST, files))
     assert len(archive.read("fits")) == 1 << 18
     with pytest.raises(CaptureError, match="more than the 262144") as caught:
         archive.read("large")
@@ -209,7 +209,7 @@ def test_an_entry_takes_a_quarter_of_the_memory_at_most(make_zip: Zip) -> None:
 
 def test_directory_with_false_sizes_takes_no_memory(make_zip: Zip) -> None:
     size = 100 << 20
-    data = bytearray(make_zip(RECORD, FILES | {"z": bytes(size)}, zipfile.ZIP_DEFLATED))
+    data = bytearray(make_zip(MANIFEST, FILES | {"z": bytes(size)}, zipfile.ZIP_DEFLATED))
     at = data.rindex(b"PK\x01\x02")
     assert struct.unpack_from("<I", data, at + 24) == (size,)
     struct.pack_into("<I", data, at + 24, 1000)
@@ -228,7 +228,7 @@ def test_directory_with_false_sizes_takes_no_memory(make_zip: Zip) -> None:
 def test_false_directory_is_refused_when_an_entry_is_read(
     make_zip: Zip, pack: int, field: int, value: int | None
 ) -> None:
-    data = bytearray(make_zip(RECORD, FILES, pack))
+    data = bytearray(make_zip(MANIFEST, FILES, pack))
     at = data.rindex(b"PK\x01\x02") + field
     # None: a few bytes into the entry itself; into another one, newer Pythons refuse that other one too.
     struct.pack_into("<I", data, at, struct.unpack_from("<I", data, at)[0] + 3 if value is None else value)
@@ -240,7 +240,7 @@ def test_false_directory_is_refused_when_an_entry_is_read(
 
 
 def test_offset_beyond_the_file_is_refused(make_zip: Zip) -> None:
-    data = make_zip(RECORD, FILES)
+    data = make_zip(MANIFEST, FILES)
     at, end = data.rindex(b"PK\x01\x02"), data.rindex(b"PK\x05\x06")
     entry, extra = bytearray(data[at:end]), struct.pack("<HHQ", 1, 8, 2**64 - 1)
     struct.pack_into("<H", entry, 30, len(extra))
@@ -255,7 +255,7 @@ def test_offset_beyond_the_file_is_refused(make_zip: Zip) -> None:
 
 def test_missing_entry_is_refused(make_zip: Zip) -> None:
     with pytest.raises(CaptureError) as caught:
-        open_archive(make_zip(RECORD, FILES)).read("none")
+        open_archive(make_zip(MANIFEST, FILES)).read("none")
     assert caught.value.fields == {"entry": "none"}
 
 
@@ -274,7 +274,7 @@ def through(data: bytes, open_file: Callable[[bytes], Any]) -> int:
 def test_an_archive_that_is_cut_off_is_refused(
     make_zip: Zip, objects: Objects, put: Callable[[str, bytes], None]
 ) -> None:
-    data = make_zip(RECORD, FILES, zipfile.ZIP_DEFLATED)
+    data = make_zip(MANIFEST, FILES, zipfile.ZIP_DEFLATED)
     lengths = {*range(0, len(data), 37), *range(len(data) - 120, len(data), 3)}
     for length in lengths:
         assert through(data[:length], io.BytesIO), length
@@ -288,7 +288,7 @@ def test_an_archive_that_is_cut_off_is_refused(
 def test_a_damaged_archive_is_a_capture_error_or_read(
     make_zip: Zip, objects: Objects, put: Callable[[str, bytes], None], pack: int
 ) -> None:
-    whole = make_zip(RECORD, FILES, pack)
+    whole = make_zip(MANIFEST, FILES, pack)
     assert through(whole, io.BytesIO) == 0
     directory = whole.index(b"PK\x01\x02")
     rng = np.random.default_rng(pack)
@@ -313,11 +313,11 @@ def test_a_damaged_archive_is_a_capture_error_or_read(
 def test_a_directory_of_too_many_entries_is_refused(make_zip: Zip) -> None:
     files = FILES | {f"more/{n}": b"" for n in range(MAX_ENTRIES)}
     with pytest.raises(CaptureError, match=f"more than {MAX_ENTRIES}"):
-        open_archive(make_zip(RECORD, files))
+        open_archive(make_zip(MANIFEST, files))
 
 
 def test_directory_that_is_a_zip_bomb_is_not_read(make_zip: Zip) -> None:
-    data = make_zip(RECORD, FILES | {f"{n:05d}" + 60_000 * "x": b"" for n in range(400)})
+    data = make_zip(MANIFEST, FILES | {f"{n:05d}" + 60_000 * "x": b"" for n in range(400)})
     tracemalloc.start()
     try:
         with pytest.raises(CaptureError, match="directory can't be read"):
@@ -329,11 +329,13 @@ def test_directory_that_is_a_zip_bomb_is_not_read(make_zip: Zip) -> None:
 
 def test_an_entry_larger_than_a_directory_may_be_is_read(make_zip: Zip) -> None:
     large = bytes(range(256)) * (9 << 12)
-    archive = CaptureArchive(io.BytesIO(make_zip(RECORD, FILES | {"large": large})), Limits(1 << 30, 1 << 30))
+    archive = CaptureArchive(
+        io.BytesIO(make_zip(MANIFEST, FILES | {"large": large})), Limits(1 << 30, 1 << 30)
+    )
     assert archive.read("large") == large
 
 
-def test_record_over_its_limit_is_refused(make_zip: Zip) -> None:
+def test_manifest_over_its_limit_is_refused(make_zip: Zip) -> None:
     limits = Limits(unpacked=1 << 24, memory=1 << 24)
     error = refused(make_zip(b" " * ((4 << 20) + 1), FILES, zipfile.ZIP_DEFLATED), limits)
     assert error.fields == {"entry": "capture.json", "limit": 4 << 20}

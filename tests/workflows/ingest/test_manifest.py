@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from storage.errors import CaptureError
 from workflows.ingest.manifest import EXAMPLE, Manifest, parse_manifest
 
-RECORD: dict[str, Any] = {
+MANIFEST: dict[str, Any] = {
     "format": "envmatte-capture/1",
     "program": {
         "monitor": {"width": 64, "height": 48, "response": {"gamma": 2.2}},
@@ -66,7 +66,7 @@ def test_malformed_text_is_refused(text: bytes) -> None:
         ),
         (
             lambda r: r["program"]["parts"].append({"kind": "halftone", "levels": [0.3]}),
-            f"program.parts.{len(RECORD['program']['parts'])}.levels.0",
+            f"program.parts.{len(MANIFEST['program']['parts'])}.levels.0",
             "multiple of 0.25",
         ),
     ],
@@ -74,9 +74,9 @@ def test_malformed_text_is_refused(text: bytes) -> None:
 def test_error_names_the_field_and_its_range(
     change: Callable[[dict[str, Any]], object], field: str, reason: str
 ) -> None:
-    record = copy.deepcopy(RECORD)
-    change(record)
-    error = refused(json.dumps(record).encode())
+    manifest = copy.deepcopy(MANIFEST)
+    change(manifest)
+    error = refused(json.dumps(manifest).encode())
     assert error.fields == {"entry": "capture.json", "field": field}
     assert reason in error.detail
 
@@ -85,13 +85,13 @@ def test_error_names_the_field_and_its_range(
     "path", ["frames", "program.parts", "program.parts.0.levels", "program.parts.0.colours"]
 )
 def test_only_the_first_of_many_errors_is_collected(path: str) -> None:
-    record = copy.deepcopy(RECORD)
-    inner: Any = record
+    manifest = copy.deepcopy(MANIFEST)
+    inner: Any = manifest
     *names, last = (int(name) if name.isdigit() else name for name in path.split("."))
     for name in names:
         inner = inner[name]
     inner[last] = [{}] * 1000
-    error = refused(json.dumps(record).encode())
+    error = refused(json.dumps(manifest).encode())
     assert str(error.fields["field"]).startswith(f"{path}.0")
     assert isinstance(error.__cause__, ValidationError)
     assert error.__cause__.error_count() < 4  # a list of millions takes gigabytes
@@ -125,13 +125,13 @@ def test_many_empty_objects_and_lists_are_refused(piece: bytes) -> None:
     ],
 )
 def test_schema_agrees_with_the_parser(change: Callable[[dict[str, Any]], object], valid: bool) -> None:
-    record = copy.deepcopy(RECORD)
-    change(record)
-    assert Draft202012Validator(SCHEMA).is_valid(record) == valid
+    manifest = copy.deepcopy(MANIFEST)
+    change(manifest)
+    assert Draft202012Validator(SCHEMA).is_valid(manifest) == valid
     if valid:
-        parse_manifest(json.dumps(record).encode())
+        parse_manifest(json.dumps(manifest).encode())
     else:
-        refused(json.dumps(record).encode())
+        refused(json.dumps(manifest).encode())
 
 
 @pytest.mark.parametrize(
@@ -143,9 +143,9 @@ def test_schema_agrees_with_the_parser(change: Callable[[dict[str, Any]], object
     ],
 )
 def test_schema_requires_either_frames_or_a_video(change: Callable[[dict[str, Any]], object]) -> None:
-    record = copy.deepcopy(RECORD)
-    change(record)
-    assert not Draft202012Validator(SCHEMA).is_valid(record)
+    manifest = copy.deepcopy(MANIFEST)
+    change(manifest)
+    assert not Draft202012Validator(SCHEMA).is_valid(manifest)
 
 
 def test_schema_is_valid_and_describes_every_field() -> None:

@@ -35,7 +35,7 @@ COMPRESSING = 50 << 20
 HEIGHT, WIDTH = 21, 37
 
 
-def record(patterns: list[int], suffix: str = "png", **more: Any) -> dict[str, Any]:
+def manifest(patterns: list[int], suffix: str = "png", **more: Any) -> dict[str, Any]:
     """The capture.json of six small patterns."""
     return {
         "format": "envmatte-capture/1",
@@ -69,7 +69,7 @@ def archive_of(
     encode = tiff if suffix == "tif" else encode_png
     files = {f"{n}.{suffix}": encode(frame) for n, frame in enumerate(stack)}
     extra = more.pop("files", {})
-    return make_zip(record(patterns, suffix, **more), files | extra)
+    return make_zip(manifest(patterns, suffix, **more), files | extra)
 
 
 PATTERNS = [4, 0, 1, 5, 0, 2, 3, 1, 4, 0]
@@ -103,7 +103,7 @@ def test_patterns_that_are_images_are_kept_on_their_grid(make_zip: Zip, ingest: 
         "a.png": encode_png(grid.repeat(8, axis=0).repeat(4, axis=1)),
         "b.png": encode_png(grid.repeat(3, 2)),
     }
-    given = record([0, 1, 2, 3])
+    given = manifest([0, 1, 2, 3])
     given["program"]["parts"][0]["levels"] = [0, 1]
     given["program"]["parts"][1] = {"kind": "images", "files": ["a.png", "b.png"]}
     pictures = {f"{n}.png": encode_png(frame) for n, frame in enumerate(shots(4, 1, "uint8"))}
@@ -115,7 +115,7 @@ def test_patterns_that_are_images_are_kept_on_their_grid(make_zip: Zip, ingest: 
 def test_patterns_that_are_large_images_are_refused(make_zip: Zip, ingest: Ingest) -> None:
     photograph = np.random.default_rng(0).integers(0, 255, (60, 60, 3), np.uint8)
     names = [f"{n}.jpg.png" for n in range(9)]
-    given = record(list(range(12)))
+    given = manifest(list(range(12)))
     given["program"]["parts"][1] = {"kind": "images", "files": names}
     pictures = {f"{n}.png": encode_png(frame) for n, frame in enumerate(shots(12, 1, "uint8"))}
     data = make_zip(given, pictures | dict.fromkeys(names, encode_png(photograph)))
@@ -133,7 +133,7 @@ def test_images_of_patterns_are_decoded_once_and_within_a_limit(
     pictures = {f"{n}.png": encode_png(frame) for n, frame in enumerate(shots(12, 1, "uint8"))}
 
     def given(names: list[str]) -> bytes:
-        made = record(list(range(12)))
+        made = manifest(list(range(12)))
         made["program"]["parts"][1] = {"kind": "images", "files": names}
         return make_zip(made, pictures | dict.fromkeys(names, flat), zipfile.ZIP_DEFLATED)
 
@@ -172,7 +172,7 @@ def test_missing_slab_is_corrupt(make_zip: Zip, ingest: Ingest) -> None:
 def test_frames_that_unpack_to_too_much_are_refused(make_zip: Zip, ingest: Ingest) -> None:
     size = 6 * HEIGHT * WIDTH * 3
     flat = encode_png(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    archive = make_zip(record([*range(6)]), {f"{n}.png": flat for n in range(6)})
+    archive = make_zip(manifest([*range(6)]), {f"{n}.png": flat for n in range(6)})
     with pytest.raises(CaptureError, match=f"6 frames of 37 x 21 pixels take {size} bytes") as caught:
         ingest("c", archive, unpacked=size - 1)
     assert caught.value.fields == {"entry": "capture.json", "field": "frames", "limit": size - 1}
@@ -184,7 +184,7 @@ def test_files_that_interrupted_workers_left_are_removed(make_zip: Zip, ingest: 
         return iter(tiles)
 
     frames = {f"{n}.png": encode_png(np.full((HEIGHT, WIDTH, 3), 40 * n, np.uint8)) for n in range(6)}
-    ingest("c", make_zip(record([*range(6)]), frames), order=leave)
+    ingest("c", make_zip(manifest([*range(6)]), frames), order=leave)
     assert not (folder / "captures/c/left#1").exists()
 
 
@@ -252,7 +252,7 @@ def test_a_frame_larger_than_a_quarter_of_the_memory_is_refused(
 def test_stack_over_the_limit_is_refused(make_zip: Zip, ingest: Ingest) -> None:
     # One small file, named by a hundred thousand frames.
     flat = encode_png(np.full((100, 100, 3), 9, np.uint8))
-    given = record([n % 6 for n in range(100_000)])
+    given = manifest([n % 6 for n in range(100_000)])
     for frame in given["frames"]:
         frame["file"] = "0.png"
     with pytest.raises(
@@ -286,7 +286,7 @@ def test_a_stack_larger_than_the_memory_is_ingested_within_it(
     y, x = np.mgrid[:980, :1440]
     smooth = np.stack([x // 4, y // 3, (x + y) // 8], axis=2).astype(np.uint8)
     files = {f"{n}.png": encode_png(smooth + np.uint8(n % 6)) for n in range(6)}
-    given = record(patterns)
+    given = manifest(patterns)
     for n, frame in enumerate(given["frames"]):
         frame["file"] = f"{n % 6}.png"
     put("large", make_zip(given, files))
@@ -314,7 +314,7 @@ def test_all_frames_get_the_orientation_of_the_first(make_zip: Zip, ingest: Inge
     mask[5:25, 5:15] = 255
     stack = ingest(
         "c",
-        make_zip(record(list(range(6)), mask="mask.png"), files | {"mask.png": encode_png(mask)}),
+        make_zip(manifest(list(range(6)), mask="mask.png"), files | {"mask.png": encode_png(mask)}),
     )
     assert (stack.width, stack.height) == (20, 30)
     np.testing.assert_array_equal(stack.read(), np.rot90(frames, 3, axes=(1, 2)))
@@ -328,7 +328,7 @@ def test_a_mask_of_frames_before_rotation_is_refused(make_zip: Zip, ingest: Inge
         ingest(
             "c",
             make_zip(
-                record(list(range(6)), mask="mask.png"),
+                manifest(list(range(6)), mask="mask.png"),
                 files | {"mask.png": encode_png(shot)},
             ),
         )

@@ -125,13 +125,13 @@ def test_a_capture_holds_what_its_format_says(
     filmed = list(ball.film(program, **options))  # type: ignore[arg-type]
     assert count == program.count == len(filmed)
     with zipfile.ZipFile(path) as archive:
-        record = json.loads(archive.read("capture.json"))
-        assert record["format"] == "envmatte-capture/1"
-        assert record["name"] == "ball"
-        assert record["response"] == "srgb"
-        assert Program.model_validate(record["program"]) == program
-        assert [frame["pattern"] for frame in record["frames"]] == list(range(count))
-        names = [frame["file"] for frame in record["frames"]]
+        manifest = json.loads(archive.read("capture.json"))
+        assert manifest["format"] == "envmatte-capture/1"
+        assert manifest["name"] == "ball"
+        assert manifest["response"] == "srgb"
+        assert Program.model_validate(manifest["program"]) == program
+        assert [frame["pattern"] for frame in manifest["frames"]] == list(range(count))
+        names = [frame["file"] for frame in manifest["frames"]]
         assert names[:2] == ["frames/00000.png", "frames/00001.png"]
         others = {"capture.json", "mask.png", "shown/one.png", "two.png"}
         assert set(archive.namelist()) == {*names, *others}
@@ -167,11 +167,11 @@ def test_frames_may_be_jpeg_and_the_mask_another(ball: Scene, program: Program) 
     film = {"noise": 0.0, "response": "srgb"}
     write_capture(ball, program, file := io.BytesIO(), mask=mask, jpeg=95, **film)  # type: ignore[arg-type]
     with zipfile.ZipFile(file) as archive:
-        record = json.loads(archive.read("capture.json"))
+        manifest = json.loads(archive.read("capture.json"))
         np.testing.assert_array_equal(imagecodecs.imread(archive.read("mask.png")) > 0, mask)
         expected = list(ball.film(program, **film))  # type: ignore[arg-type]
-        assert record["response"] == "srgb"
-        for frame, exact in zip(record["frames"], expected, strict=True):
+        assert manifest["response"] == "srgb"
+        for frame, exact in zip(manifest["frames"], expected, strict=True):
             content = archive.read(frame["file"])
             assert content.startswith(b"\xff\xd8")
             assert np.mean((imagecodecs.jpeg_decode(content) - exact.astype(float)) ** 2) < 25

@@ -16,7 +16,7 @@ from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
 
 Ingest = Callable[..., Stack]
-RECORD = {
+MANIFEST = {
     "format": "envmatte-capture/1",
     "program": {
         "monitor": {"width": 64, "height": 48},
@@ -61,7 +61,7 @@ def test_frames_of_one_row_or_column_are_drawn(
     ingest: Ingest, make_zip: Callable[..., bytes], width: int, height: int, size: tuple[int, int]
 ) -> None:
     files = {f"{n}.png": encode_png(np.full((height, width, 1), 60 * n + 9, np.uint8)) for n in range(4)}
-    stack = ingest("c", make_zip(RECORD, files))
+    stack = ingest("c", make_zip(MANIFEST, files))
     with Image.open(io.BytesIO(thumbnail(stack))) as small:
         assert small.size == size
     with Image.open(io.BytesIO(contact_sheet(stack))) as sheet:
@@ -70,7 +70,7 @@ def test_frames_of_one_row_or_column_are_drawn(
 
 def test_grey_frames_have_one_too(ingest: Ingest, make_zip: Callable[..., bytes]) -> None:
     files = {f"{n}.png": encode_png(np.full((12, 16, 1), 60 * n + 9, np.uint8)) for n in range(4)}
-    with Image.open(io.BytesIO(contact_sheet(ingest("c", make_zip(RECORD, files))))) as sheet:
+    with Image.open(io.BytesIO(contact_sheet(ingest("c", make_zip(MANIFEST, files))))) as sheet:
         assert sheet.size == (4 * (CAPTION + 8) + 8, 12 + 18 + 16)
-    with Image.open(io.BytesIO(thumbnail(ingest("d", make_zip(RECORD, files))))) as small:
+    with Image.open(io.BytesIO(thumbnail(ingest("d", make_zip(MANIFEST, files))))) as small:
         assert (small.size, small.getcolors()) == ((16, 12), [(192, (69, 69, 69))])  # the white frame

@@ -43,10 +43,10 @@ def filmed(
     """The capture as another exposure, or a camera that takes something off, would have had it."""
     target = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(capture_archive)) as archive, zipfile.ZipFile(target, "w") as out:
-        record = json.loads(archive.read("capture.json"))
-        out.writestr("capture.json", json.dumps(record | more))
-        out.writestr(record["mask"], archive.read(record["mask"]))
-        for frame in record["frames"]:
+        manifest = json.loads(archive.read("capture.json"))
+        out.writestr("capture.json", json.dumps(manifest | more))
+        out.writestr(manifest["mask"], archive.read(manifest["mask"]))
+        for frame in manifest["frames"]:
             values = decode(archive.read(frame["file"]), memory=1 << 24).astype(np.float64) * gain - less
             if curve is not None:
                 values = 255 * curve(values / 255)

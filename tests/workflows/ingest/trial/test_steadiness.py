@@ -68,14 +68,14 @@ def filmed(ball: Ball, shifts: NDArray[np.float64], gains: NDArray[np.float64]) 
     rng = np.random.default_rng(4)
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w") as archive:
-        record = {
+        manifest = {
             "format": "envmatte-capture/1",
             "program": program.model_dump(mode="json"),
             "frames": [{"file": f"{n}.png", "pattern": n} for n in range(program.count)],
             "response": "linear",
             "mask": "mask.png",
         }
-        archive.writestr("capture.json", json.dumps(record))
+        archive.writestr("capture.json", json.dumps(manifest))
         archive.writestr("mask.png", encode_png(mask[..., np.newaxis].astype(np.uint8) * 255))
         for n, picture in enumerate(light):
             value = 0.02 + 0.72 * gains[n] * blurred(picture, tuple(shifts[n]))

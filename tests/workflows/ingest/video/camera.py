@@ -140,13 +140,13 @@ def capture(
     program: Program, video: bytes, rate: float, name: str = "clip.mp4"
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The capture.json of a video, and the files beside it."""
-    record = {
+    manifest = {
         "format": "envmatte-capture/1",
         "program": program.model_dump(mode="json"),
         "response": "srgb",
         "video": {"file": name, "patterns_per_second": rate},
     }
-    return record, {name: video}
+    return manifest, {name: video}
 
 
 def turned(video: bytes, matrix: Sequence[int]) -> bytes:
@@ -232,9 +232,9 @@ def boxes(video: bytes) -> Iterator[tuple[str, int, int]]:
         at += size
 
 
-def zipped(record: bytes, files: dict[str, bytes]) -> bytes:
+def zipped(manifest: bytes, files: dict[str, bytes]) -> bytes:
     """A capture archive of a capture.json and files."""
-    return zip_bytes({"capture.json": record, **files})
+    return zip_bytes({"capture.json": manifest, **files})
 
 
 def fragmented(samples: int) -> bytes:

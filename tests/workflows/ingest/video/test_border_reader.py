@@ -70,9 +70,9 @@ def ingest_film(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> C
             shown += [light] * repeats
             numbers += [step.number] * repeats
         made = film(shown, camera)
-        record, files = capture(program, made.data, 1 / camera.hold)
-        record["video"]["border"] = border.model_dump(mode="json")
-        return ingest("c", make_zip(record | more, files)), made, numbers
+        manifest, files = capture(program, made.data, 1 / camera.hold)
+        manifest["video"]["border"] = border.model_dump(mode="json")
+        return ingest("c", make_zip(manifest | more, files)), made, numbers
 
     return run
 

@@ -30,9 +30,9 @@ def ingest_film(make_zip: Callable[..., bytes], ingest: Callable[..., Any]) -> C
             shown += [light] * round(step.seconds / HOLD)
         before = next(at for at, light in enumerate(shown) if light is patterns[0])
         made = film(shown, camera)
-        record, files = capture(program, made.data, 1 / HOLD)
-        record["video"]["border"] = {"width": 216, "height": 160}
-        return ingest("c", make_zip(record, files)), made, before
+        manifest, files = capture(program, made.data, 1 / HOLD)
+        manifest["video"]["border"] = {"width": 216, "height": 160}
+        return ingest("c", make_zip(manifest, files)), made, before
 
     return run
 
