@@ -102,10 +102,9 @@ class CaptureArchive:
     def _read_manifest(self) -> Manifest:
         info = self._entries.get(MANIFEST)
         if info is None:
-            if (
-                folder := next((one for one in self._entries if one.endswith(f"/{MANIFEST}")), None)
-            ) is not None:
-                why = f"{folder} must be at the root of the archive: put in what is in that folder, and not the folder"
+            nested = next((one for one in self._entries if one.endswith(f"/{MANIFEST}")), None)
+            if nested is not None:
+                why = f"{nested} must be at the root of the archive: put in what is in that folder, and not the folder"
             elif MATTE in self._entries:
                 why = "this is the archive of a matte: import it, with `envmatte import` or in the web app"
             else:

@@ -35,11 +35,8 @@ PIECE = 1 << 18
 KEPT_BYTES = 32 << 20
 """Freed memory that a decoder keeps for the next picture."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-_CONNECTION, _OPEN_UNTIL_END = (
-    3,
-    4,
-)  # the open files of a decoder besides the standard ones, which lead nowhere
-
+# The open files of a decoder besides the standard ones, which lead nowhere.
+_CONNECTION, _OPEN_UNTIL_END = 3, 4
 
 _signs: "_Signs | None" = None
 

@@ -30,11 +30,8 @@ _JUNK = 8.0  # of an event without a boundary
 _JUNK_OUTSIDE = 3.0  # of an event before the program or after it
 _MAX_JUNK = 24
 _EDGE = {"seen": 0.0, "hidden": 6.0, "cut": 40.0}
-_AT_EDGE = {
-    "seen": slice(0, 1),
-    "hidden": slice(1, 2),
-    "cut": slice(1, None),
-}  # boundaries, counted from the beginning or the end of the program
+# Boundaries that may be the first or the last one in an event, counted from that end of the program.
+_AT_EDGE = {"seen": slice(0, 1), "hidden": slice(1, 2), "cut": slice(1, None)}
 _ELBOW = 4.0  # standard deviations above which the cost of timing grows only linearly
 
 

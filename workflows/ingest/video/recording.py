@@ -21,10 +21,9 @@ _LEAST_CHANGE = 0.6  # of so many codes,
 _LEAST_SHARE = 0.015  # and of this share of the large changes: codecs refine a picture after it appears
 _CLEAN = 3.0  # a frame is not torn if it is off by at most so many times the plateau's own spread,
 _LEAST_CLEAN = 0.3  # and the spread is taken for at least so many codes
-_DRIFTS = (
-    0.05  # a plateau whose brightness, in codes, runs one way by this share is one whose exposure settles:
-)
-_SETTLED = 0.02  # only frames within this share of its end are used
+# A plateau whose brightness, in codes, runs one way by this share is one whose exposure settles: only its frames within
+# this share of the end are used.
+_DRIFTS, _SETTLED = 0.05, 0.02
 _ONE_WAY = 1.5  # brightness runs one way if its changes add up to no more than so many times the whole change
 
 
