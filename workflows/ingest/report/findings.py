@@ -96,15 +96,15 @@ def _white(figures: Figures) -> Finding:
             remedy=f"expose {less} less, or add frames of a shorter exposure",
         )
     level = graded(-reach, -0.5, -0.15)
-    message = f"white reaches {100 * reach:.0f} % of the range"
+    share = f"{100 * reach:.0f} % of the range"
     if level == "good":
-        return Finding(name="exposure", level=level, message=message)
+        return Finding(name="exposure", level=level, message=f"white reaches {share}")
     stops = floor(2 * log2(0.9 / max(reach, 0.01))) / 2
     more = "half a stop" if stops <= 0.5 else "a stop" if stops == 1 else f"{stops:g} stops"
     return Finding(
         name="exposure",
         level=level,
-        message=f"white reaches only {message[14:]}",
+        message=f"white reaches only {share}",
         remedy=f"expose {more} more",
     )
 
