@@ -18,7 +18,7 @@ from workflows.untrusted.limits import check_size
 BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1"})
 """What such a file calls itself in its first box (ISO/IEC 23008-12, sect. 10). The last two may hold other codecs."""
 NOT_WIDE = (1, 2)
-"""Colour primaries (table 2 there) that are sRGB's, or not stated."""
+"""Colour primaries (ITU-T H.273, table 2) that are sRGB's, or not stated."""
 PROPERTIES = 10_000
 """Boxes that are looked at to find the orientation: a picture of 1,000 tiles has some dozens of properties."""
 

@@ -46,8 +46,7 @@ class Spread(NamedTuple):
 
     def at(self, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.float32]:
         """The light at n places in cells of the first grid, (n, channels m) float32."""
-        light = np.empty((x.size, self.light.shape[2]), np.float32)
-        light[:] = 0
+        light = np.zeros((x.size, self.light.shape[2]), np.float32)
         _add_interpolated(self.light, self.spacing, x.astype(np.float64), y.astype(np.float64), 1.0, light)
         return light
 

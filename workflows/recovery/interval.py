@@ -21,8 +21,8 @@ REACH = 2
 """Grids from that of a node to the one whose nodes are its surroundings: four times as wide."""
 HELD_OUT = 8
 """One of so many patterns is held out."""
-PARAMETERS = 2.5
-"""How many values of the noise of the mean of all frames S, rho and the sum of T have, as a variance."""
+FIT_VARIANCE = 2.5
+"""Variance that S, rho and the sum of T add to a composite, in variances of the mean of all frames."""
 CALM = 0.2
 """Share of the errors where there is least contrast."""
 _SMALLEST, _LARGEST, _HALVINGS = -12.0, 3.0, 40  # powers of ten
@@ -133,7 +133,7 @@ def fit_interval(
     recovered than others, the contrast that they see tells only in part. Fewer patterns make larger errors, so
     intervals are a little too wide.
     """
-    each = PARAMETERS / max(frames, 1.0)
+    each = FIT_VARIANCE / max(frames, 1.0)
     known = variance * (1 + each)
     calm = contrast <= np.quantile(contrast, CALM)
     further = _least_of(error[calm], np.ones(np.count_nonzero(calm)), known[calm])

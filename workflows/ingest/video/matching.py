@@ -27,9 +27,9 @@ Refusal = Callable[[str], CaptureError]
 MAX_MATCHED = 2000
 """Patterns of a program that is filmed: matching takes memory in proportion to their square."""
 MIN_SHARE = 0.6
-"""A recording with a smaller share of the patterns that are not constant is refusal."""
+"""A recording with a smaller share of the patterns that are not constant is refused."""
 MIN_RESEMBLANCE = 2.5
-"""A recording with a smaller `resemblance.score` is refusal."""
+"""A recording with a smaller `resemblance.score` is refused."""
 MANY = 32
 """Random patterns from which on the score counts for more than the numbers in a border: the right program's, if it has
 fewer, may be as small as a wrong one's."""
