@@ -58,7 +58,7 @@ def normalise(
     noise: NoiseModel,
     least_contrast: float,
     usable: NDArray[np.bool_] | None = None,
-    frames: NDArray[np.number] | None = None,
+    worth: NDArray[np.number] | None = None,
 ) -> Measurements:
     """Convert measurements to the +-1 form of eq. 8.
 
@@ -74,8 +74,8 @@ def normalise(
         A channel whose rho is below this many standard deviations of a mid-grey value is ignored.
     usable : (n, m, 3) bool, optional
         False where a value must be ignored, as where the camera clipped it. Default: all are usable.
-    frames : (m,) or (n, m, 3) number, optional
-        Frames averaged into each value, above 0. Default: 1.
+    worth : (m,) or (n, m, 3) number, optional
+        How many frames each value is worth, above 0: as many as were averaged into it, or fewer. Default: 1.
 
     Returns
     -------
@@ -107,9 +107,9 @@ def normalise(
     if usable is not None:
         valid &= usable.transpose(0, 2, 1)
     light = np.where(valid, light, 0)
-    if frames is not None and frames.ndim == 3:
-        frames = frames.transpose(0, 2, 1)
-    variance = noise.variance(light) / (1 if frames is None else frames)
+    if worth is not None and worth.ndim == 3:
+        worth = worth.transpose(0, 2, 1)
+    variance = noise.variance(light) / (1 if worth is None else worth)
     constant_variance = np.stack([photometry.black, photometry.white], axis=2)
     value = np.where(valid, 2 * (light - S) / scale - 1, 0)
     variance = np.where(valid, 4 * variance / scale**2, np.inf)

@@ -52,7 +52,7 @@ def fit_photometry(
     levels: NDArray[np.float32],
     usable: NDArray[np.bool_],
     noise: NoiseModel,
-    frames: NDArray[np.number],
+    worth: NDArray[np.number],
 ) -> Photometry:
     """Fit S and rho to frames of constant monitors.
 
@@ -66,8 +66,8 @@ def fit_photometry(
         False where a value must be ignored, as where the camera clipped it.
     noise : NoiseModel
         Noise of one frame.
-    frames : (k,) or (n, k, 3) number
-        Frames averaged into each value, above 0; a longer exposure counts as several.
+    worth : (k,) or (n, k, 3) number
+        How many frames each value is worth, above 0; a longer exposure counts as several.
 
     Returns
     -------
@@ -96,11 +96,10 @@ def fit_photometry(
     _check_shapes(values, levels, usable)
     if (np.ptp(levels, axis=0) == 0).any():
         raise ValueError("every channel needs at least two different constant levels")
-    worth = np.where(
-        _select_values(levels, usable), frames[:, None] if frames.ndim == 1 else frames, 0
-    ).astype(np.float64)
-    S, rho, *_ = _fit_line(values, levels, worth)
-    weight = worth / noise.variance(S[:, None] + rho[:, None] * levels)
+    of_value = worth[:, None] if worth.ndim == 1 else worth
+    used = np.where(_select_values(levels, usable), of_value, 0).astype(np.float64)
+    S, rho, *_ = _fit_line(values, levels, used)
+    weight = used / noise.variance(S[:, None] + rho[:, None] * levels)
     return Photometry(*(array.astype(np.float32) for array in _fit_line(values, levels, weight)))
 
 

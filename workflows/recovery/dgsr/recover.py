@@ -34,7 +34,7 @@ def recover(
     sensing: Sensing,
     noise: NoiseModel,
     usable: NDArray[np.bool_] | None = None,
-    frames: NDArray[np.number] | None = None,
+    worth: NDArray[np.number] | None = None,
     options: DgsrOptions = DEFAULT,
     conditions: Conditions = PLAIN,
 ) -> Transport:
@@ -52,8 +52,8 @@ def recover(
         Noise of one frame.
     usable : (n, m, 3) bool, optional
         False where a measurement must be ignored, as where the camera clipped it. Default: all are usable.
-    frames : (m,) or (n, m, 3) number, optional
-        Frames averaged into each measurement, above 0. Default: 1.
+    worth : (m,) or (n, m, 3) number, optional
+        How many frames each measurement is worth, above 0: as many as were averaged into it, or fewer. Default: 1.
     options : DgsrOptions
     conditions : Conditions
         Without stray light, which must have been subtracted.
@@ -105,7 +105,7 @@ def recover(
     needed = 1 + max(int(level.patterns.max()) for level in sensing.levels)
     if measurements.shape[1] < needed:
         raise ValueError(f"measurements are of {measurements.shape[1]} patterns, the levels have {needed}")
-    measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, frames)
+    measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, worth)
     measured = less_certain(measured, conditions.model_error)
     value, weight = _weight_measurements(measured.value[..., :-2], measured.variance[..., :-2])
     parts = []

@@ -60,7 +60,7 @@ def recover(
     patterns: Patterns,
     noise: NoiseModel,
     usable: NDArray[np.bool_] | None = None,
-    frames: NDArray[np.number] | None = None,
+    worth: NDArray[np.number] | None = None,
     options: LobesOptions = FINE,
     conditions: Conditions = PLAIN,
     places: NDArray[np.integer] | None = None,
@@ -79,8 +79,8 @@ def recover(
         Noise of one frame.
     usable : (n, m, 3) bool, optional
         False where a value must be ignored, as where the camera clipped it. Default: all are usable.
-    frames : (m,) or (n, m, 3) number, optional
-        Frames averaged into each value, above 0. Default: 1.
+    worth : (m,) or (n, m, 3) number, optional
+        How many frames each value is worth, above 0: as many as were averaged into it, or fewer. Default: 1.
     options : LobesOptions
     conditions : Conditions
     places : (n, 2) int, optional
@@ -137,9 +137,9 @@ def recover(
         usable[:, :, 1:] = False
     stray: NDArray[np.float32] | None = None
     if len(strays) > 1:
-        stray, photometry = find_strong_strays(measurements, photometry, strays, usable, frames)
+        stray, photometry = find_strong_strays(measurements, photometry, strays, usable, worth)
         measurements = measurements - stray
-    measured = normalise(measurements, photometry, noise, options.least_contrast, usable, frames)
+    measured = normalise(measurements, photometry, noise, options.least_contrast, usable, worth)
     counts = np.zeros((n, 3), np.int64)
     found = Diagnostics(
         np.zeros_like(measured.value),
