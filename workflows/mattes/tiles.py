@@ -165,7 +165,7 @@ def recover_block(
         sensing, constants = sensing_of(objects, capture), method.constants
         transport = dgsr.recover(measurements, photometry, sensing, noise, usable, worth, method, conditions)
         measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, worth)
-        error, least_weight = dgsr.error_of(transport, photometry, measured, sensing), LEAST_WEIGHT
+        error, least_weight = dgsr.composite_error(transport, photometry, measured, sensing), LEAST_WEIGHT
     else:
         found = lobes.recover(
             measurements, photometry, patterns, noise, usable, worth, method, conditions, places

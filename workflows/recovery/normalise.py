@@ -121,7 +121,7 @@ def normalise(
     )
 
 
-def less_certain(measured: Measurements, model_error: float) -> Measurements:
+def add_model_error(measured: Measurements, model_error: float) -> Measurements:
     """Add the error of the model to the variances of patterns, but not to those of the black and white monitor.
 
     The contrast of patterns is twice that of the unit of `model_error`.

@@ -43,7 +43,7 @@ def expected(
     survey : dict
         See `workflows.ingest.report.survey`.
     model_error : float
-        See `error_of`.
+        See `model_error_of`.
     pattern_error : float, optional
         See there, in camera units.
     exposures : sequence of float, optional
@@ -112,7 +112,7 @@ def expected(
     return Quality(low=ends[0], high=ends[1], blocks=blocks)
 
 
-def error_of(attributes: dict[str, Any]) -> float:
+def model_error_of(attributes: dict[str, Any]) -> float:
     """The error of the model that a stack's measurements promise of composites, as a share of rho.
 
     See `workflows.ingest.trial.unexplained`; captures of earlier versions have no ``smooth_error``.

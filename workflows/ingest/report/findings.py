@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from workflows.ingest.measured_light import patterns_seen
-from workflows.ingest.report.expected_psnr import costs_of, error_of
+from workflows.ingest.report.expected_psnr import costs_of, model_error_of
 from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
 from workflows.ingest.report.frame_findings import constants, frames, named, odd_frames, order
 from workflows.ingest.report.limits import (
@@ -35,7 +35,11 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     """
     survey = attributes["survey"]
     costs = costs_of(
-        program, patterns_seen(attributes), survey, error_of(attributes), attributes.get("auto_exposure")
+        program,
+        patterns_seen(attributes),
+        survey,
+        model_error_of(attributes),
+        attributes.get("auto_exposure"),
     )
     files = attributes.get("files")  # missing from films, and captures of earlier versions
     if attributes.get("order"):  # what else would be found means nothing
@@ -53,7 +57,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *curves(figures, program, linear=attributes["storage"]["black"] > 0),
         *_glare(attributes.get("glare")),
         _crosstalk(figures, program, grey=survey.get("grey", False)),
-        *unexplained(costs["model_error"], error_of(attributes)),
+        *unexplained(costs["model_error"], model_error_of(attributes)),
         *lost_colour(program, costs["lost_colour"], half_colour=attributes.get("half_colour", False)),
         *_noise(figures, attributes, costs["noise"]),
         *_flicker(figures.flicker, files, mapped=bool(attributes.get("tone_mapping"))),

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from workflows.ingest.measured_light import patterns_seen
-from workflows.ingest.report.expected_psnr import error_of, expected
+from workflows.ingest.report.expected_psnr import expected, model_error_of
 from workflows.ingest.report.figures import (
     LEVELS,
     Clipping,
@@ -82,7 +82,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
             program,
             patterns_seen(attributes),
             survey,
-            error_of(attributes),
+            model_error_of(attributes),
             attributes.get("pattern_error"),
             attributes.get("auto_exposure"),
         ),

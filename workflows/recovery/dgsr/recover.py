@@ -13,8 +13,8 @@ from workflows.recovery.normalise import (
     PLAIN,
     Conditions,
     Measurements,
+    add_model_error,
     expected_error,
-    less_certain,
     normalise,
 )
 from workflows.recovery.sensing import Sensing
@@ -106,7 +106,7 @@ def recover(
     if measurements.shape[1] < needed:
         raise ValueError(f"measurements are of {measurements.shape[1]} patterns, the levels have {needed}")
     measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, worth)
-    measured = less_certain(measured, conditions.model_error)
+    measured = add_model_error(measured, conditions.model_error)
     value, weight = _weight_measurements(measured.value[..., :-2], measured.variance[..., :-2])
     parts = []
     for first in range(0, max(len(value), 1), _BLOCK):
@@ -159,7 +159,7 @@ def _recover_block(
     return rows.transport(levels[-1], np.where(alive, index, -1))
 
 
-def error_of(
+def composite_error(
     transport: Transport,
     photometry: Photometry,
     measured: Measurements,

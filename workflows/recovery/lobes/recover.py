@@ -18,8 +18,8 @@ from workflows.recovery.normalise import (
     PLAIN,
     Conditions,
     Measurements,
+    add_model_error,
     expected_error,
-    less_certain,
     normalise,
     refit_photometry,
 )
@@ -155,7 +155,7 @@ def recover(
         stray += np.where(known[..., np.newaxis], weak, 0).transpose(0, 2, 1)
         photometry, measured = _without_strays(photometry, measured, found.stray, known)
     better = refit_photometry(
-        photometry, less_certain(measured, conditions.model_error), found.response, found.kappa
+        photometry, add_model_error(measured, conditions.model_error), found.response, found.kappa
     )
     if conditions.grey:
         better = Photometry(*(np.repeat(values[:, :1], 3, axis=1) for values in better))
@@ -177,11 +177,11 @@ def _recover_measured(
     n, channels, m = measured.value.shape
     alive: NDArray[np.bool_] = np.any(np.isfinite(measured.variance), axis=(1, 2))
     # The channels' errors of the model are alike, so their mean has the same.
-    own = less_certain(measured, model_error)
+    own = add_model_error(measured, model_error)
     if patterns.channels == 1:
         joint = _average_channels(measured)
         separate = _channels_disagree(measured, joint.value, options.disagreement)
-        joint = less_certain(joint, model_error)
+        joint = add_model_error(joint, model_error)
     else:
         joint = Measurements(own.value.reshape(n, channels * m), own.variance.reshape(n, channels * m))
         separate = np.zeros(n, bool)

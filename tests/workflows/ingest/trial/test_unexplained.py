@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import Curve, to_light
-from workflows.ingest.report.expected_psnr import error_of
+from workflows.ingest.report.expected_psnr import model_error_of
 from workflows.ingest.trial import unexplained
 from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.programs.parts import Constant
@@ -127,7 +127,7 @@ def test_channels_that_are_one_leave_the_noise_of_quantisation(
 
     stack = ingest("c", captured(program, see))
     assert stack.attributes["noise"]["read"] >= LEAST_READ
-    assert error_of(stack.attributes) > 0.1
+    assert model_error_of(stack.attributes) > 0.1
 
 
 def test_error_of_the_model_is_what_channels_have_in_common(
@@ -145,7 +145,7 @@ def test_errors_of_compression_are_no_promise_and_limit_the_noise_of_a_film(
 ) -> None:
     """Compression's errors are alike in the channels and differ from pixel to pixel."""
     stack = ingest("c", filmed(scene, program, error=0.02))
-    assert error_of(stack.attributes) == stack.attributes["model_error"] > 0.01
+    assert model_error_of(stack.attributes) == stack.attributes["model_error"] > 0.01
     stack.annotate(video={}, noise={"read": (5 * NOISE) ** 2, "shot": 0.0})
     sample = take_sample(stack)
     assert sample is not None
@@ -153,6 +153,6 @@ def test_errors_of_compression_are_no_promise_and_limit_the_noise_of_a_film(
     patterns = lay_out(program, monitor, [])
     unexplained.find_unexplained(stack, program, monitor, patterns, sample, np.zeros((stack.frames, 3)))
     assert stack.attributes["model_error"] > 0.01
-    assert error_of(stack.attributes) < 0.5 * stack.attributes["model_error"]
+    assert model_error_of(stack.attributes) < 0.5 * stack.attributes["model_error"]
     assert stack.attributes["noise_of_patterns"]
     assert deviation(stack)[1] < 3 * NOISE
