@@ -110,7 +110,7 @@ def normalise(
     if worth is not None and worth.ndim == 3:
         worth = worth.transpose(0, 2, 1)
     variance = noise.variance(light) / (1 if worth is None else worth)
-    constant_variance = np.stack([photometry.black, photometry.white], axis=2)
+    constant_variance = np.stack([photometry.black_variance, photometry.white_variance], axis=2)
     value = np.where(valid, 2 * (light - S) / scale - 1, 0)
     variance = np.where(valid, 4 * variance / scale**2, np.inf)
     constants = np.where(alive, np.array([-1, 1], np.float32), 0)
@@ -178,8 +178,8 @@ def refit_photometry(
     a = np.where(known, (mean_value - g[..., None] * mean)[..., 0], 0)
     S, white = photometry.S, photometry.S + photometry.rho
     black_range, white_range = (
-        _MOST_CHANGE * np.sqrt(photometry.black),
-        _MOST_CHANGE * np.sqrt(photometry.white),
+        _MOST_CHANGE * np.sqrt(photometry.black_variance),
+        _MOST_CHANGE * np.sqrt(photometry.white_variance),
     )
     new_S = np.clip(S + photometry.rho * (1 + a - g) / 2, S - black_range, S + black_range)
     new_white = np.clip(S + photometry.rho * (1 + a + g) / 2, white - white_range, white + white_range)
@@ -187,8 +187,8 @@ def refit_photometry(
     return Photometry(
         S.astype(np.float32),
         np.where(known, white - S, photometry.rho).astype(np.float32),
-        photometry.black,
-        photometry.white,
+        photometry.black_variance,
+        photometry.white_variance,
     )
 
 

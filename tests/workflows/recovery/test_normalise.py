@@ -29,7 +29,7 @@ def test_normalise_gives_the_signed_form_and_its_variance(photometry):
     np.testing.assert_allclose(value[0], [[-1, 1, -1, 1], [1, 0, -1, 1], [0, 0, 0, 0]], atol=1e-6)
     np.testing.assert_allclose(value[1], [[0, 0, -1, 1]] * 3, atol=1e-6)
     seen = NOISE.variance(np.array([0.1, 0.6], np.float32))
-    ends = [photometry.black[0, 0], photometry.white[0, 0]]
+    ends = [photometry.black_variance[0, 0], photometry.white_variance[0, 0]]
     np.testing.assert_allclose(variance[0, 0], 4 * np.append(seen, ends) / 0.5**2, rtol=1e-6)
     assert (variance[0, 2] == np.inf).all()
     assert (value.dtype, variance.dtype) == (np.float32, np.float32)
@@ -55,7 +55,9 @@ def test_measurements_of_other_pixels_are_refused(photometry):
 
 def test_refit_is_weighted_least_squares_in_camera_values(photometry):
     # known too badly to hold the fit back
-    photometry = photometry._replace(black=np.full((2, 3), 4e-4), white=np.full((2, 3), 4e-4))
+    photometry = photometry._replace(
+        black_variance=np.full((2, 3), 4e-4), white_variance=np.full((2, 3), 4e-4)
+    )
     rng = np.random.default_rng(0)
     m, kappa = 30, np.zeros((2, 3))
     kappa[1, 1] = 0.05
@@ -100,7 +102,9 @@ def test_refit_ignores_overconfident_transport(photometry):
     )
     response = np.concatenate([response, ends], axis=2).astype(np.float32)
     fit = refit_photometry(photometry, measured, response, np.ones((2, 3)))
-    black, white = (3 * np.sqrt(variance) for variance in (photometry.black, photometry.white))
+    black, white = (
+        3 * np.sqrt(variance) for variance in (photometry.black_variance, photometry.white_variance)
+    )
     assert (np.abs(fit.S - photometry.S) <= black).all()
     assert (np.abs(fit.rho - photometry.rho) <= black + white).all()
 

@@ -37,14 +37,14 @@ class Photometry(NamedTuple):
         Light not from the monitor, in camera units (full scale is 1).
     rho : (n, 3) float32
         Camera value per unit of the monitor's light, 0 or more.
-    black, white : (n, 3) float32
+    black_variance, white_variance : (n, 3) float32
         Variances of S and of S + rho, the camera's values under a black and a white monitor.
     """
 
     S: NDArray[np.float32]
     rho: NDArray[np.float32]
-    black: NDArray[np.float32]
-    white: NDArray[np.float32]
+    black_variance: NDArray[np.float32]
+    white_variance: NDArray[np.float32]
 
 
 def fit_photometry(

@@ -241,8 +241,8 @@ def _without_strays(
         Photometry(
             np.where(known, S, photometry.S).astype(np.float32),
             np.where(known, rho, photometry.rho).astype(np.float32),
-            photometry.black,
-            photometry.white,
+            photometry.black_variance,
+            photometry.white_variance,
         ),
         Measurements(
             np.where(known[..., np.newaxis], value, measured.value),

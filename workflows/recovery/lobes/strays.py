@@ -76,7 +76,9 @@ def find_strong_strays(
     # From here on strong values alone, few of n times 3.
     values, weight = values[strong], weight[strong]
     weight /= np.maximum(after / count[..., 0], 1e-12)[strong, np.newaxis]
-    weight[:, m:] = 1 / np.stack([photometry.black[strong], photometry.white[strong]], axis=1)
+    weight[:, m:] = 1 / np.stack(
+        [photometry.black_variance[strong], photometry.white_variance[strong]], axis=1
+    )
     found, covariance = solve_least_squares(design, weight, values)
     stray = np.zeros(measurements.transpose(0, 2, 1).shape, np.float32)
     stray[strong] = found[:, 2:] @ design[:m, 2:].T

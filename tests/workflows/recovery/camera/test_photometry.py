@@ -30,8 +30,8 @@ def test_fit_is_weighted_least_squares():
             expected = np.linalg.lstsq(design, values[p, :, c] * root, rcond=None)[0]
             np.testing.assert_allclose([fit.S[p, c], fit.rho[p, c]], expected, atol=2e-6)
             (black, both), (_, slope) = np.linalg.inv(design.T @ design)
-            np.testing.assert_allclose(fit.black[p, c], black, rtol=1e-5)
-            np.testing.assert_allclose(fit.white[p, c], black + 2 * both + slope, rtol=1e-5)
+            np.testing.assert_allclose(fit.black_variance[p, c], black, rtol=1e-5)
+            np.testing.assert_allclose(fit.white_variance[p, c], black + 2 * both + slope, rtol=1e-5)
     np.testing.assert_allclose(fit.S, S, atol=0.01)
     np.testing.assert_allclose(fit.rho, rho, atol=0.03)
     assert fit.S.dtype == fit.rho.dtype == np.float32

@@ -49,8 +49,8 @@ def test_t_is_recovered_beside_stray_light(patterns_of, gaussian, observe, chann
     from_constants = type(photometry)(
         (photometry.S + light[..., -2]).astype(np.float32),
         (photometry.rho + light[..., -1] - light[..., -2]).astype(np.float32),
-        photometry.black,
-        photometry.white,
+        photometry.black_variance,
+        photometry.white_variance,
     )
     clean = recover(measurements, photometry, shown, noise)
     beside = recover(seen, from_constants, shown, noise, conditions=Conditions(strays=strays))
