@@ -113,25 +113,26 @@ def work(objects: Objects, task: Task, tile: int) -> int:
     ClipError
         If a frame that was there when the clip was looked over can't be decoded again.
     """
-    transfer, placement = task.options["transfer"], Placement(**task.options["placement"])
-    length, job, matte = task.plan["length"], task.job, task.matte
-    ticks = _ticks(objects, job)[tile * length : (tile + 1) * length]
+    transfer, length = task.options["transfer"], task.plan["length"]
+    ticks = _ticks(objects, task.job)[tile * length : (tile + 1) * length]
     cache = Cache(objects, KEPT)
-    put, light = cache.matte(matte), tone_curves.table(transfer, np.dtype(np.uint16))
+    matte, read = cache.matte(task.matte), partial(cache.strip, task.matte)
+    light = tone_curves.table(transfer, np.dtype(np.uint16))
     # Jobs of earlier versions lack both.
     has_around, fits_frame = task.options.get("around") == "backdrop", task.options.get("fit") == "frame"
-    where = None if placement == Placement() else placement
+    stated = Placement(**task.options["placement"])
+    placement = None if stated == Placement() else stated
     if fits_frame:
-        where = over_frame(put, where)
+        placement = over_frame(matte, placement)
 
     def shown(frame: NDArray[np.uint16]) -> NDArray[np.uint8]:
         """An 8 bit picture; where the mask left the matte out, it is black or shows the backdrop."""
         backdrop = Backdrop(frame, light)
-        picture = composite(put, backdrop, placement=where, read=partial(cache.strip, matte), threads=1)
+        picture = composite(matte, backdrop, placement=placement, read=read, threads=1)
         if fits_frame:
-            picture = expose(put, picture)
+            picture = expose(matte, picture)
         if has_around:
-            picture = put_around(put, backdrop, where, picture, Window.of(put), threads=1)
+            picture = put_around(matte, backdrop, placement, picture, Window.of(matte), threads=1)
         return encode(picture, transfer, np.dtype(np.uint8), 1, 3).astype(np.uint8, copy=False)
 
     with _reading(objects, task) as (decoder, file):
@@ -139,8 +140,8 @@ def work(objects: Objects, task: Task, tile: int) -> int:
         frames = films.means(decoder, file, NAME, plan, task.plan["width"], task.plan["height"])
         pictures = (shown(frame) for frame in frames)
         segment = segments.encode(pictures, task.plan["rate"], length, transfer)
-    objects.put(composites.segment_path(job, tile), segment)
-    return len(ticks) * put.width * put.height
+    objects.put(composites.segment_path(task.job, tile), segment)
+    return len(ticks) * matte.width * matte.height
 
 
 def missing(objects: Objects, task: Task) -> list[int]:
