@@ -7,6 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+SAMPLES = 256
+"""Samples of a measured curve: one for each code of 8 bits."""
+BLACK = 4096
+"""The code of no light where float values are stored as uint16, so that negative noise has codes below it."""
+# About how many pixels curves are fitted to.
+_PIXELS = 4096
+
 
 class Gamma(BaseModel):
     """A pure power law: light = value ** gamma."""
@@ -15,19 +22,12 @@ class Gamma(BaseModel):
     gamma: Annotated[float, Field(ge=0.2, le=5.0, description="The exponent.", examples=[2.2])]
 
 
-SAMPLES = 256
-"""Samples of a measured curve: one for each code of 8 bits."""
-
-
 class Sampled(BaseModel):
     """A measured curve: the light at equally spaced values from 0 to 1, with straight lines between them."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     light: Annotated[tuple[float, ...], Field(min_length=SAMPLES, max_length=SAMPLES)]
 
-
-# About how many pixels curves are fitted to.
-_SAMPLE = 4096
 
 Curve = Literal["linear", "srgb"] | Gamma | Sampled
 CameraCurve = Curve | tuple[Curve, Curve, Curve]
@@ -41,10 +41,6 @@ class Estimate(NamedTuple):
     monitor: Curve
     camera: Curve
     assumed: tuple[str, ...]
-
-
-BLACK = 4096
-"""The code of no light where float values are stored as uint16, so that negative noise has codes below it."""
 
 
 def to_light(values: NDArray[np.float32], curve: Curve) -> NDArray[np.float32]:
@@ -138,7 +134,7 @@ def estimate(
     best: ``t (S + rho b)`` for the light b of the monitor (eq. 6), or ``t x`` for the exposures t of a level. A gamma
     must beat the named curves by 2 % of the squared error, because it has a free parameter.
     """
-    some, step = usable.any(axis=1), max(1, values.shape[1] // _SAMPLE)
+    some, step = usable.any(axis=1), max(1, values.shape[1] // _PIXELS)
     levels, exposures = levels[some], exposures[some]
     values, usable = values[some, ::step], usable[some, ::step]
     enough = len(np.unique(levels)) >= 3 and _varies(values, usable)
