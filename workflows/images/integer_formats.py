@@ -267,11 +267,11 @@ def _by_pillow(picture: Image.Image, memory: int) -> NDArray[np.uint8]:
 def encode_png(pixels: Codes) -> bytes:
     """Encode (height, width, 1 to 4) uint8 or uint16 values as PNG."""
     file = io.BytesIO()
-    pack_png(file, pixels)
+    save_png(file, pixels)
     return file.getvalue()
 
 
-def pack_png(file: IO[bytes], pixels: Codes) -> None:
+def save_png(file: IO[bytes], pixels: Codes) -> None:
     """Write (height, width, 1 to 4) uint8 or uint16 values as PNG."""
     height, width, channels = pixels.shape
     write_png(file, width, height, channels, pixels.dtype.type, [pixels])

@@ -133,7 +133,7 @@ def read_light(
     look_up = look_up_of(stack)
     top = clipped_from(stack)
 
-    def flatten(light: Floats, frame: int) -> Floats:
+    def corrected(light: Floats, frame: int) -> Floats:
         if gain is not None:
             light = light / gain.at(y, x, frame)[:, np.newaxis]
         return even_out(light, frame, attributes)
@@ -145,7 +145,7 @@ def read_light(
 
         def at_rest(frame: int) -> tuple[Floats, Bools]:
             return (
-                flatten(light_of_codes(codes[frame], look_up), frame),
+                corrected(light_of_codes(codes[frame], look_up), frame),
                 (codes[frame] > 0) & (codes[frame] < top),
             )
 
@@ -157,7 +157,7 @@ def read_light(
 
         def in_place(frame: int) -> tuple[Floats, Bools]:
             values, whole = unclipped_light(around[frame], shifts[frame], margin, look_up, top)
-            return flatten(values[recovered], frame), whole[recovered]
+            return corrected(values[recovered], frame), whole[recovered]
 
         frame_of = in_place
     y, x = places_in(span, recovered).T
@@ -348,7 +348,6 @@ def unclipped_light(
     -------
     values : (..., h - 2 margin, w - 2 margin, channels) float32
     whole : the same, bool
-
     """
     values = shift_back(light_of_codes(codes, look_up), shift, margin)
     clipped = (codes == 0) | (codes >= top)

@@ -193,7 +193,7 @@ class CompositeRequest:
 
     def _packed(self, codes: Codes, headers: dict[str, str]) -> Response:
         if self.media_type == PNG and codes.nbytes > MEMORY_BYTES:
-            return file_response(partial(integer_formats.pack_png, pixels=codes), PNG, headers)
+            return file_response(partial(integer_formats.save_png, pixels=codes), PNG, headers)
         if self.media_type == PNG:
             return bytes_response(integer_formats.encode_png(codes), PNG, headers)
         jpeg = integer_formats.encode_jpeg(codes[..., :3], self.params.quality)
