@@ -147,6 +147,13 @@ def thumbnail_edge(height: int, width: int) -> int:
     return -(-max(height, width) // THUMBNAIL)
 
 
+def thumbnail_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of a thumbnail's blocks have a pixel of a mask, (height, width), in them; (rows, columns) bool."""
+    edge = thumbnail_edge(*mask.shape)
+    down, across = (np.arange(0, size, edge) for size in mask.shape)
+    return np.logical_or.reduceat(np.logical_or.reduceat(mask, down, axis=0), across, axis=1)
+
+
 def _thumbnail(frame: NDArray[np.unsignedinteger]) -> NDArray[np.uint16]:
     """The mean values of the blocks of a frame, over its channels too, (rows, columns); 65535 is full scale."""
     height, width, channels = frame.shape

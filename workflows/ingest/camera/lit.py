@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.layout.captures import Stack, thumbnail_edge
+from storage.layout.captures import Stack, thumbnail_edge, thumbnail_mask
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.measured_light import exposures_of
 from workflows.programs.program import Program
@@ -39,13 +39,11 @@ def find_lit(stack: Stack, program: Program) -> NDArray[np.bool_]:
     curve: Curve = "linear" if stack.attributes["response"] == "linear" else "srgb"
     dark, bright = (to_light(part.astype(np.float32) / np.float32(65535), curve) for part in (black, white))
     exceeds = bright.min(axis=0) - dark.max(axis=0)
-    edge = thumbnail_edge(stack.height, stack.width)
-    down, across = (np.arange(0, size, edge) for size in (stack.height, stack.width))
-    wanted = np.logical_or.reduceat(np.logical_or.reduceat(stack.mask(), down, axis=0), across, axis=1)
-    brightest = np.quantile(exceeds[wanted], BRIGHTEST)
+    brightest = np.quantile(exceeds[thumbnail_mask(stack.mask())], BRIGHTEST)
     if brightest <= 0:
         return every
     seen: NDArray[np.bool_] = exceeds > SHARE * brightest
+    edge = thumbnail_edge(stack.height, stack.width)
     return seen.repeat(edge, axis=0)[: stack.height].repeat(edge, axis=1)[:, : stack.width]
 
 

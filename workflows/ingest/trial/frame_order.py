@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.layout.captures import Stack, thumbnail_edge
+from storage.layout.captures import Stack, thumbnail_mask
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.measured_light import exposures_of
@@ -246,12 +246,8 @@ def _light_of(stack: Stack) -> Floats | None:
     thumbnails = stack.thumbnails()
     if thumbnails is None:
         return None
-    edge = thumbnail_edge(stack.height, stack.width)
-    down, across = (np.arange(0, size, edge) for size in (stack.height, stack.width))
-    wanted = np.logical_or.reduceat(np.logical_or.reduceat(stack.mask(), down, axis=0), across, axis=1)
-    light = to_light(
-        thumbnails[:, wanted].astype(np.float32) / np.float32(65535), _curve(stack.attributes["response"])
-    )
+    codes = thumbnails[:, thumbnail_mask(stack.mask())]
+    light = to_light(codes.astype(np.float32) / np.float32(65535), _curve(stack.attributes["response"]))
     changes = light.std(axis=0)
     light = light[:, changes > CHANGES * np.quantile(changes, BRIGHTEST)]
     if light.shape[1] < FEWEST:
