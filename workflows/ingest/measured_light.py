@@ -75,6 +75,12 @@ def look_up_of(stack: Stack) -> Floats:
     return table(camera, stack.dtype, stack.attributes["storage"]["black"])
 
 
+def monitor_curve_of(attributes: dict[str, Any]) -> Curve:
+    """The monitor's curve, as stated or as calibration has found it."""
+    curve: Curve = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
+    return curve
+
+
 def even_out(light: Floats, frame: int, attributes: dict[str, Any]) -> Floats:
     """The light of a frame as in one of usual exposure, if the camera's exposure changed by itself."""
     exposed = attributes.get("auto_exposure")

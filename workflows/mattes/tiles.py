@@ -7,14 +7,13 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from storage.layout.mattes import Block, Matte, empty_block
 from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve
 from workflows.ingest.local_gain import Surroundings, local_gain
-from workflows.ingest.measured_light import conditions_of, observe, places_in, read_light
+from workflows.ingest.measured_light import conditions_of, monitor_curve_of, observe, places_in, read_light
 from workflows.mattes.cut_out import CutOut
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
@@ -206,8 +205,7 @@ def grid_of(objects: Objects, capture: str, options: RecoveryOptions) -> tuple[i
 def program_of(objects: Objects, capture: str) -> tuple[Program, Curve]:
     """A capture's program and monitor curve, kept from tile to tile: a capture never changes."""
     attributes = Stack(objects, capture).attributes
-    monitor = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
-    return Program.model_validate(attributes["program"]), monitor
+    return Program.model_validate(attributes["program"]), monitor_curve_of(attributes)
 
 
 @lru_cache(maxsize=1)

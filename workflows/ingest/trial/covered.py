@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from storage.layout.captures import Stack
-from workflows.images.tone_curves import Curve
 from workflows.ingest.measured_light import exposures_of, odd_frames
 from workflows.ingest.trial.frame_order import MOST_ODD
 from workflows.ingest.trial.trial_recovery import (
+    Calibrated,
     Doubles,
     PixelSample,
     RecoveredSample,
@@ -14,7 +13,6 @@ from workflows.ingest.trial.trial_recovery import (
     recover_seen,
 )
 from workflows.programs.parts import Bernoulli
-from workflows.programs.program import Program
 from workflows.recovery.sensing import Patterns
 
 OFF, UNUSUAL = 0.1, 6.0
@@ -33,20 +31,13 @@ share this differs at most: where more is missing, most of the object is covered
 
 
 def find_covered(
-    stack: Stack,
-    program: Program,
-    monitor: Curve,
-    patterns: Patterns,
-    sample: PixelSample,
-    found: RecoveredSample,
+    capture: Calibrated, patterns: Patterns, sample: PixelSample, found: RecoveredSample
 ) -> bool:
     """Find the stills in which something covers a part of the object, and add them to ``odd_frames`` of the stack.
 
     Parameters
     ----------
-    stack : Stack
-    program : Program
-    monitor : Curve
+    capture : Calibrated
     patterns : Patterns
         With the glare that was found.
     sample : PixelSample
@@ -66,6 +57,7 @@ def find_covered(
     What moves, or is sharpened, makes some pixels brighter and others darker: the mean of a square is hardly off. What
     all squares have in common is the exposure.
     """
+    stack, program, _ = capture
     is_random = any(isinstance(part, Bernoulli) for part in program.parts)
     # The frames of a film were compared when they were matched, and what jolts it would be taken for a hand. In another
     # order no frame is like its pattern. Without random patterns, none tells what another one does.
@@ -74,7 +66,7 @@ def find_covered(
     before, most = odd_frames(stack.attributes), int(MOST_ODD * stack.frames)
     held: list[int] = []
     while True:
-        off = np.abs(_off(stack, program, patterns, sample, found))
+        off = np.abs(_off(capture, patterns, sample, found))
         far = np.sort(np.nan_to_num(off), axis=1)[:, -SQUARES]
         if held and far[held[-1]] <= COVERED:
             break
@@ -87,7 +79,7 @@ def find_covered(
             break
         held.append(int(np.argmax(np.where(is_off, off**2, 0).sum(axis=1))))
         stack.annotate(odd_frames=sorted(before + held))
-        again = recover_seen(stack, program, monitor, patterns, found.seen, np.zeros(stack.frames))
+        again = recover_seen(capture, patterns, found.seen, np.zeros(stack.frames))
         if again is None:
             held = []
             break
@@ -98,13 +90,12 @@ def find_covered(
     return bool(held)
 
 
-def _off(
-    stack: Stack, program: Program, patterns: Patterns, sample: PixelSample, found: RecoveredSample
-) -> Doubles:
+def _off(capture: Calibrated, patterns: Patterns, sample: PixelSample, found: RecoveredSample) -> Doubles:
     """How far the light of each square is from what is predicted, as a share of white's, (frames, squares) float64.
 
     Frames of constants and half-tones, and squares of too few values, are NaN.
     """
+    stack, program, _ = capture
     attributes, photometry, alive, seen = stack.attributes, found.photometry, found.alive, found.seen
     exposures = exposures_of(attributes)
     apart = np.linalg.inv(np.array(attributes["crosstalk"])).astype(np.float32).T

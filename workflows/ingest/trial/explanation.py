@@ -3,17 +3,15 @@
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
-from workflows.images.tone_curves import Curve
 from workflows.ingest.camera.border_exposure import BorderLight, BorderValues
 from workflows.ingest.camera.calibration import calibrate, is_free
 from workflows.ingest.local_gain import local_gain
-from workflows.ingest.measured_light import look_up_of
+from workflows.ingest.measured_light import look_up_of, monitor_curve_of
 from workflows.ingest.trial.covered import find_covered
 from workflows.ingest.trial.tone_mapping import find_tone_mapping
-from workflows.ingest.trial.trial_recovery import PixelSample, take_sample
+from workflows.ingest.trial.trial_recovery import Calibrated, PixelSample, take_sample
 from workflows.ingest.trial.unexplained import MEASURED, Unexplained, find_unexplained
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
@@ -28,17 +26,16 @@ class Explained(NamedTuple):
 
     Attributes
     ----------
-    monitor : Curve
-        The monitor's curve.
+    capture : Calibrated
     light : Patterns
-        By this curve, without glare.
+        The program's, by the monitor's curve, without glare.
     wide : PixelSample
         A sample of all that sees the monitor.
     unexplained : Unexplained
         The last recovery, and what it leaves.
     """
 
-    monitor: Curve
+    capture: Calibrated
     light: Patterns
     wide: PixelSample
     unexplained: Unexplained
@@ -58,7 +55,7 @@ def explain(
     wide = sample if stack.mask().all() else take_sample(stack, masked=False) or sample
     found = _explain(stack, program, sample, wide, border)
     if found is not None and find_covered(
-        stack, program, found.monitor, found.unexplained.patterns, sample, found.unexplained.recovered
+        found.capture, found.unexplained.patterns, sample, found.unexplained.recovered
     ):
         # All that was measured with them may be wrong.
         calibrate(stack, border)
@@ -73,10 +70,10 @@ def _explain(
     """Find what T leaves unexplained in a sample, local tone mapping first, by a wide one."""
     at_rest, turn = np.zeros((stack.frames, 3)), 0
     while True:
-        monitor: Curve = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
-        light = lay_out(program, monitor, stack.images(), scaled=stack.attributes["scaled"])
+        capture = Calibrated(stack, program, monitor_curve_of(stack.attributes))
+        light = lay_out(program, capture.monitor, stack.images(), scaled=stack.attributes["scaled"])
         measured = {name: stack.attributes[name] for name in MEASURED}
-        found = find_unexplained(stack, program, monitor, light, wide, at_rest)
+        found = find_unexplained(capture, light, wide, at_rest)
         mapped = None
         if found is not None and turn < TONE_MAPPING_TURNS:
             known = stack.attributes["tone_mapping"]
@@ -87,8 +84,8 @@ def _explain(
         turn += 1
     if wide is not sample:
         stack.annotate(**measured)
-        found = find_unexplained(stack, program, monitor, light, sample, at_rest)
-    return None if found is None else Explained(monitor, light, wide, found)
+        found = find_unexplained(capture, light, sample, at_rest)
+    return None if found is None else Explained(capture, light, wide, found)
 
 
 def _border_light(stack: Stack, border: BorderValues | None) -> BorderLight | None:

@@ -8,11 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from numba.core.event import install_recorder
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
-from workflows.images.tone_curves import Curve
-from workflows.ingest.trial.trial_recovery import PixelSample, RecoveredSample, recover_seen, see_sample
+from workflows.ingest.measured_light import monitor_curve_of
+from workflows.ingest.trial.trial_recovery import (
+    Calibrated,
+    PixelSample,
+    RecoveredSample,
+    recover_seen,
+    see_sample,
+)
 from workflows.programs.parts import Bernoulli
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import NoiseModel
@@ -69,7 +74,7 @@ def try_qualities(stack: Stack, sample: PixelSample, patterns: Patterns) -> dict
     """
     attributes = stack.attributes
     program = Program.model_validate(attributes["program"])
-    monitor: Curve = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
+    capture = Calibrated(stack, program, monitor_curve_of(attributes))
     shifts, gains = np.zeros((stack.frames, 2)), np.zeros(stack.frames)
     if attributes["shifts"] is not None:
         shifts = np.array(attributes["shifts"])
@@ -90,18 +95,16 @@ def try_qualities(stack: Stack, sample: PixelSample, patterns: Patterns) -> dict
     seconds: dict[str, float] = {}
     without: dict[str, RecoveredSample] = {}
     for name, options in QUALITIES.items():
-        taken = _seconds(
-            partial(recover_seen, stack, program, monitor, patterns, seen, gains, options, places)
-        )
+        taken = _seconds(partial(recover_seen, capture, patterns, seen, gains, options, places))
         if taken is None:
             return None
         seconds[name] = round(share * taken, 2)
         if can_tell:
-            found = recover_seen(stack, program, monitor, patterns, spread, gains, options, held_out=held_out)
+            found = recover_seen(capture, patterns, spread, gains, options, held_out=held_out)
             without |= {name: found} if found else {}
     predictions = _predict(patterns, list(without.values()), chosen) if without else []
     intervals = {
-        name: _interval(stack, program, found, *prediction, chosen)
+        name: _interval(capture, found, *prediction, chosen)
         for (name, found), prediction in zip(without.items(), predictions, strict=True)
     }
     return {name: QualityTrial(taken, intervals.get(name)) for name, taken in seconds.items()}
@@ -119,14 +122,14 @@ def _seconds(recover: Callable[[], RecoveredSample | None]) -> float | None:
 
 
 def _interval(
-    stack: Stack,
-    program: Program,
+    capture: Calibrated,
     found: RecoveredSample,
     predicted: NDArray[np.float32],
     contrast: NDArray[np.float32],
     chosen: NDArray[np.intp],
 ) -> Interval | None:
     """The interval by what a recovery predicts of some patterns; None if too little of these was seen."""
+    stack, program, _ = capture
     attributes, channels, photometry = stack.attributes, stack.channels, found.photometry
     noise, model_error = NoiseModel(**attributes["noise"]), float(attributes["model_error"])
     shown = program.measured[chosen]

@@ -133,10 +133,10 @@ def find_steadiness(
     explained = explain(stack, program, sample, border)
     if explained is None:
         return None
-    monitor, light, wide, (at_first, through, _) = explained
+    capture, light, wide, (at_first, through, _) = explained
     begin = np.zeros((stack.frames, 3))
-    at_rest = measure_rest(stack, program, monitor, through, sample, begin, at_first)
-    try_out = partial(try_recovery, stack, program, monitor, through, sample)
+    at_rest = measure_rest(capture, through, sample, begin, at_first)
+    try_out = partial(try_recovery, capture, through, sample)
     patterns = np.array(stack.attributes["patterns"])
     shown = np.isin(patterns, program.measured)
     if np.count_nonzero(np.isfinite(at_rest.off[shown]).all(axis=1)) < MIN_FRAMES:
@@ -144,7 +144,7 @@ def find_steadiness(
     first, has_black = at_rest, bool(np.isin(black_patterns(program), patterns).any())
     free = is_free(stack.attributes["auto_exposure"])
     if free:
-        begin[shown, 2] = find_white_excess(stack, program, monitor, light, wide)
+        begin[shown, 2] = find_white_excess(capture, light, wide)
         first = try_out(begin) or at_rest
         # Most of what is lit is clipped: the gain of a frame is less exact than its exposure by the border.
         first = first._replace(off=first.off * [1, 1, 0])
@@ -167,7 +167,7 @@ def find_steadiness(
     )
     if not corrected.any():
         return through
-    again = find_unexplained(stack, program, monitor, light, sample, corrected)
+    again = find_unexplained(capture, light, sample, corrected)
     return again and again.patterns
 
 

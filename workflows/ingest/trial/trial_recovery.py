@@ -67,6 +67,22 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 
+class Calibrated(NamedTuple):
+    """A capture after `calibrate`, as all trials take it.
+
+    Attributes
+    ----------
+    stack : Stack
+    program : Program
+    monitor : Curve
+        The monitor's curve.
+    """
+
+    stack: Stack
+    program: Program
+    monitor: Curve
+
+
 class PixelSample(NamedTuple):
     """Pixels of some squares in all frames.
 
@@ -213,17 +229,15 @@ class RecoveredSample(NamedTuple):
 
 
 def recover_sample(
-    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: PixelSample, state: Doubles
+    capture: Calibrated, patterns: Patterns, sample: PixelSample, state: Doubles
 ) -> RecoveredSample | None:
     """Recover the sample from frames corrected by ``state``, (frames, 3); None if it has too little contrast."""
-    seen = see_sample(stack, sample, state[:, :2])
-    return recover_seen(stack, program, monitor, patterns, seen, state[:, 2])
+    seen = see_sample(capture.stack, sample, state[:, :2])
+    return recover_seen(capture, patterns, seen, state[:, 2])
 
 
 def recover_seen(
-    stack: Stack,
-    program: Program,
-    monitor: Curve,
+    capture: Calibrated,
     patterns: Patterns,
     seen: Seen,
     gains: Doubles,
@@ -242,6 +256,7 @@ def recover_seen(
     held_out : sequence of int, optional
         Patterns, as numbers among those measured, that are not used.
     """
+    stack, program, monitor = capture
     attributes = stack.attributes | {"gains": np.exp(gains).tolist() if gains.any() else None}
     noise = NoiseModel(**attributes["noise"])
     found = light_of(lambda n: (seen.values[n], seen.whole[n]), attributes, program, seen.values.shape[1])
@@ -280,23 +295,18 @@ def _joined(parts: list[Recovery]) -> Recovery:
 
 
 def try_recovery(
-    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: PixelSample, state: Doubles
+    capture: Calibrated, patterns: Patterns, sample: PixelSample, state: Doubles
 ) -> Trial | None:
     """Recover the sample from frames corrected by ``state``, (frames, 3), and measure what remains."""
-    found = recover_sample(stack, program, monitor, patterns, sample, state)
-    return found and measure_rest(stack, program, monitor, patterns, sample, state, found)
+    found = recover_sample(capture, patterns, sample, state)
+    return found and measure_rest(capture, patterns, sample, state, found)
 
 
 def measure_rest(
-    stack: Stack,
-    program: Program,
-    monitor: Curve,
-    patterns: Patterns,
-    sample: PixelSample,
-    state: Doubles,
-    found: RecoveredSample,
+    capture: Calibrated, patterns: Patterns, sample: PixelSample, state: Doubles, found: RecoveredSample
 ) -> Trial:
     """Measure how the frames differ from what the recovery of a sample predicts."""
+    stack, program, monitor = capture
     photometry, transport, alive, seen = found.photometry, found.transport, found.alive, found.seen
     attributes, gains = stack.attributes, np.exp(state[:, 2])
     noise, model_error = NoiseModel(**attributes["noise"]), attributes["model_error"]

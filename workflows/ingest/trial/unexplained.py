@@ -5,9 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.layout.captures import Stack
-from workflows.images.tone_curves import Curve
 from workflows.ingest.trial.trial_recovery import (
+    Calibrated,
     Doubles,
     Floats,
     PixelSample,
@@ -15,7 +14,6 @@ from workflows.ingest.trial.trial_recovery import (
     predict,
     recover_sample,
 )
-from workflows.programs.program import Program
 from workflows.recovery.camera.noise import LEAST_READ, NoiseModel, fit_noise
 from workflows.recovery.glare import LEAST, Spread, centres, filter_patterns, fit_shares, spread_patterns
 from workflows.recovery.normalise import normalise
@@ -61,7 +59,7 @@ class Unexplained(NamedTuple):
 
 
 def find_unexplained(
-    stack: Stack, program: Program, monitor: Curve, patterns: Patterns, sample: PixelSample, state: Doubles
+    capture: Calibrated, patterns: Patterns, sample: PixelSample, state: Doubles
 ) -> Unexplained | None:
     """Estimate what T leaves unexplained in a sample of the pixels, and annotate the stack with it.
 
@@ -74,9 +72,7 @@ def find_unexplained(
 
     Parameters
     ----------
-    stack : Stack
-    program : Program
-    monitor : Curve
+    capture : Calibrated
     patterns : Patterns
         The program's, without glare.
     sample : PixelSample
@@ -97,6 +93,7 @@ def find_unexplained(
     that are alike in the channels, but not in neighbouring pixels: they limit the weight of a measurement, but
     composites have little of them, since patterns are many.
     """
+    stack = capture.stack
     stack.annotate(glare=None, model_error=0.0, smooth_error=0.0, pattern_error=None)
     before, assumed = NoiseModel(**stack.attributes["noise"]), stack.attributes["assumed_noise"]
     noise, of_patterns = before, stack.attributes["noise_of_patterns"]
@@ -106,10 +103,10 @@ def find_unexplained(
     while True:
         rounds += 1
         stack.annotate(noise={"read": noise.read, "shot": noise.shot}, model_error=error)
-        found = recover_sample(stack, program, monitor, through, sample, state)
+        found = recover_sample(capture, through, sample, state)
         if found is None:
             return None
-        rest = Rest(stack, found, program, patterns, through, spreads, noise)
+        rest = Rest(capture, found, patterns, through, spreads, noise)
         last = shares
         shares = rest.shares(error)
         if not LEAST <= shares.sum() <= MOST_GLARE:
@@ -136,15 +133,15 @@ class Rest:
 
     def __init__(
         self,
-        stack: Stack,
+        capture: Calibrated,
         found: RecoveredSample,
-        program: Program,
         patterns: Patterns,
         through: Patterns,
         spreads: list[Spread],
         noise: NoiseModel,
     ) -> None:
-        shown, channels, self.noise = program.measured, stack.channels, noise
+        stack, shown, self.noise = capture.stack, capture.program.measured, noise
+        channels = stack.channels
         self.filmed = "video" in stack.attributes
         at = slice(None, channels)
         first = {pattern: frame for frame, pattern in reversed(list(enumerate(stack.attributes["patterns"])))}

@@ -4,11 +4,8 @@ from functools import partial
 
 import numpy as np
 
-from storage.layout.captures import Stack
-from workflows.images.tone_curves import Curve
-from workflows.ingest.trial.trial_recovery import PixelSample, try_recovery
+from workflows.ingest.trial.trial_recovery import Calibrated, PixelSample, try_recovery
 from workflows.ingest.trial.unexplained import MEASURED, find_unexplained
-from workflows.programs.program import Program
 from workflows.recovery.sensing import Patterns
 
 MOST = 0.4
@@ -17,18 +14,14 @@ EXACT = 0.01
 """and how exactly it is found."""
 
 
-def find_white_excess(
-    stack: Stack, program: Program, monitor: Curve, light: Patterns, sample: PixelSample
-) -> float:
+def find_white_excess(capture: Calibrated, light: Patterns, sample: PixelSample) -> float:
     """The logarithm of the factor by which the border overestimates the exposure of white, if that was free.
 
     It is the gain of all patterns, in units of white's.
 
     Parameters
     ----------
-    stack : Stack
-    program : Program
-    monitor : Curve
+    capture : Calibrated
     light : Patterns
         The program's, without glare.
     sample : PixelSample
@@ -50,11 +43,12 @@ def find_white_excess(
     """
     from scipy.optimize import minimize_scalar  # takes half a second to import
 
+    stack, program, _ = capture
     measured = {name: stack.attributes[name] for name in MEASURED}
     state, shown = np.zeros((stack.frames, 3)), np.isin(stack.attributes["patterns"], program.measured)
-    excess, found = 0.0, find_unexplained(stack, program, monitor, light, sample, state)
+    excess, found = 0.0, find_unexplained(capture, light, sample, state)
     if found is not None:
-        try_out = partial(try_recovery, stack, program, monitor, found.patterns, sample)
+        try_out = partial(try_recovery, capture, found.patterns, sample)
 
         def left(gain: float) -> float:
             state[shown, 2] = gain

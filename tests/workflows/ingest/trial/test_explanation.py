@@ -59,10 +59,10 @@ def test_tone_mapping_is_told_by_pixels_around_the_mask_and_the_rest_by_those_in
 ) -> None:
     stack, tried = measured(masked=True), []
 
-    def find_unexplained(*given: Any) -> Any:
-        tried.append((given[4], stack.attributes["model_error"]))
+    def find_unexplained(capture: Any, patterns: Any, sample: str, state: Any) -> Any:
+        tried.append((sample, stack.attributes["model_error"]))
         stack.annotate(model_error=0.1)
-        return SimpleNamespace(rest=f"rest of {given[4]}", patterns=None, recovered=None)
+        return SimpleNamespace(rest=f"rest of {sample}", patterns=None, recovered=None)
 
     def find_tone_mapping(_: Stack, rest: str, sample: str, *known: Any) -> None:
         assert (rest, sample) == ("rest of all", "all")

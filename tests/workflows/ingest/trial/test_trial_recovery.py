@@ -9,7 +9,7 @@ import pytest
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
 from workflows.ingest.trial import trial_recovery
-from workflows.ingest.trial.trial_recovery import ALONE, recover_sample, take_sample
+from workflows.ingest.trial.trial_recovery import ALONE, Calibrated, recover_sample, take_sample
 from workflows.programs.pyramid_light import lay_out
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
@@ -30,7 +30,7 @@ def test_a_sample_is_the_same_in_any_parts_and_on_any_threads(
     def recovered(alone: int, cores: int) -> list[bytes]:
         monkeypatch.setattr(trial_recovery, "ALONE", alone)
         monkeypatch.setattr(trial_recovery, "CORES", cores)
-        found = recover_sample(stack, program, "srgb", patterns, sample, at_rest)
+        found = recover_sample(Calibrated(stack, program, "srgb"), patterns, sample, at_rest)
         assert found
         assert len(found.photometry.S) == len(found.transport.count) == n
         fields = (*vars(found.transport).values(), *found.photometry)

@@ -5,15 +5,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 from scipy.ndimage import gaussian_filter
 
 from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
-from workflows.images.tone_curves import Curve, to_light
+from workflows.images.tone_curves import to_light
+from workflows.ingest.measured_light import monitor_curve_of
 from workflows.ingest.report.expected_psnr import model_error_of
 from workflows.ingest.trial import unexplained
-from workflows.ingest.trial.trial_recovery import take_sample
+from workflows.ingest.trial.trial_recovery import Calibrated, take_sample
 from workflows.programs.parts import Constant
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
@@ -149,9 +149,9 @@ def test_errors_of_compression_are_no_promise_and_limit_the_noise_of_a_film(
     stack.annotate(video={}, noise={"read": (5 * NOISE) ** 2, "shot": 0.0})
     sample = take_sample(stack)
     assert sample is not None
-    monitor = TypeAdapter[Curve](Curve).validate_python(stack.attributes["monitor_curve"])
-    patterns = lay_out(program, monitor, [])
-    unexplained.find_unexplained(stack, program, monitor, patterns, sample, np.zeros((stack.frames, 3)))
+    capture = Calibrated(stack, program, monitor_curve_of(stack.attributes))
+    patterns = lay_out(program, capture.monitor, [])
+    unexplained.find_unexplained(capture, patterns, sample, np.zeros((stack.frames, 3)))
     assert stack.attributes["model_error"] > 0.01
     assert model_error_of(stack.attributes) < 0.5 * stack.attributes["model_error"]
     assert stack.attributes["noise_of_patterns"]

@@ -10,7 +10,7 @@ from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
 from workflows.ingest.trial.steadiness import find_steadiness
-from workflows.ingest.trial.trial_recovery import take_sample
+from workflows.ingest.trial.trial_recovery import Calibrated, take_sample
 from workflows.ingest.trial.white_exposure import find_white_excess
 from workflows.programs.pyramid_light import lay_out
 from workflows.simulation.glass_ball import glass_ball
@@ -35,7 +35,8 @@ def stack_of(ingest: Ingest, excess: float, light: float = 0.7) -> Stack:
 def found(stack: Stack) -> float:
     sample = take_sample(stack, masked=False)
     assert sample is not None
-    return float(np.exp(find_white_excess(stack, PROGRAM, "srgb", lay_out(PROGRAM, "srgb", ()), sample)))
+    capture = Calibrated(stack, PROGRAM, "srgb")
+    return float(np.exp(find_white_excess(capture, lay_out(PROGRAM, "srgb", ()), sample)))
 
 
 @pytest.mark.parametrize("excess", [0.9, 1.15])
