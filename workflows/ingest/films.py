@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from workflows.images import hdr
-from workflows.ingest.video.decoder import Clip, open_clip
+from workflows.ingest.video.clip import Clip, open_clip
 from workflows.ingest.video.frame_means import Share, mean_frames
 from workflows.ingest.video.signatures import CELLS, LARGE_CELLS, LargeFrames, Signatures, take_signatures
 from workflows.untrusted.decoder import Decoder, blaming
@@ -21,7 +21,7 @@ waits while small copies are made, and a film of 76 s in full HD takes 13.1 s ra
 
 
 class Film(BaseModel):
-    """What is known of a film once all of it has been read; see `workflows.ingest.video.decoder.Clip`.
+    """What is known of a film once all of it has been read; see `workflows.ingest.video.clip.Clip`.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ def times(
     -------
     film : Film
     ticks, last
-        As of `workflows.ingest.video.decoder.Clip.ticks`.
+        As of `workflows.ingest.video.clip.Clip.ticks`.
 
     Raises
     ------

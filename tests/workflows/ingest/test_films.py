@@ -18,7 +18,7 @@ from tests.workflows.ingest.video.camera import fragmented, overstated
 from tests.workflows.ingest.video.films import CAMERA, IngestFilm, error_of
 from workflows.images.hdr import HLG, light_of_hdr
 from workflows.ingest import films
-from workflows.ingest.video.decoder import open_clip
+from workflows.ingest.video.clip import open_clip
 from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
 from workflows.ingest.video.signatures import CELLS, take_signatures
 from workflows.untrusted.decoder import Decoder

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from storage.errors import CaptureError
 from workflows.images.hdr import is_hdr, to_srgb
-from workflows.ingest.video.decoder import UNSTATED, Clip, tick_of
+from workflows.ingest.video.clip import UNSTATED, Clip, tick_of
 
 PLANAR = {
     "gray": "gray16le",

@@ -9,7 +9,7 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
-from workflows.ingest.video.decoder import Clip, tick_of
+from workflows.ingest.video.clip import Clip, tick_of
 
 CELLS = (32, 24)
 """Columns and rows of a signature."""

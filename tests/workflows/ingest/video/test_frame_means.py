@@ -11,7 +11,7 @@ from av.video.reformatter import ColorRange, Colorspace
 
 from tests.workflows.ingest.video.camera import interlaced, stated_by_container
 from workflows.images import hdr
-from workflows.ingest.video.decoder import Clip
+from workflows.ingest.video.clip import Clip
 from workflows.ingest.video.frame_means import ACCURATE, TOTAL_WEIGHT, Share, mean_frames
 from workflows.ingest.video.signatures import take_signatures
 

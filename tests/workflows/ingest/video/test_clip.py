@@ -15,7 +15,7 @@ from tests.parts.inputs.heics import heic
 from tests.workflows.composite.video.test_steps import clip, even, pictures
 from tests.workflows.ingest.video.camera import Camera, Film, as_transport_stream, boxes, film, turned
 from tests.workflows.ingest.video.films import IngestFilm, error_of, misplaced, missing
-from workflows.ingest.video.decoder import Clip
+from workflows.ingest.video.clip import Clip
 from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share, mean_frames
 
 TURNS = {
