@@ -76,7 +76,7 @@ ATTACKS = {
     "composites of 16 megapixels": "POST mattes/{large}/composite",
     "16 megapixels for a browser": "GET mattes/{large}/live",
     "the same as a page": "GET mattes/{large}/live.html",
-    "look-ups of 16 megapixels": "GET mattes/{large}/layers/lookups.exr?lookups=1",
+    "lookups of 16 megapixels": "GET mattes/{large}/layers/lookups.exr?lookups=1",
     "archives of 16 megapixels": "GET mattes/{large}/archive",
     "captures with a large program": "GET captures/{program}",
     "jobs for such captures": "POST jobs capture={program}",

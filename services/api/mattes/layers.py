@@ -29,7 +29,7 @@ from workflows.threads import CORES
 
 router = Router(tags=["mattes"])
 MOST_BYTES = 1 << 30
-"""The most that a file of lobes or look-ups may have before it is compressed: it waits in a temporary file."""
+"""The most that a file of lobes or lookups may have before it is compressed: it waits in a temporary file."""
 MEDIA_TYPES = {
     "png": "image/png",
     "exr": "image/x-exr",
@@ -67,7 +67,7 @@ Lookups = Annotated[
     Query(
         ge=1,
         le=LOOKUPS,
-        description="The most look-ups of a pixel in the files of a node; further cells are merged into these.",
+        description="The most lookups of a pixel in the files of a node; further cells are merged into these.",
     ),
 ]
 OverPlate = Annotated[

@@ -34,7 +34,7 @@ BLOCK_BYTES = 16 << 20
     },
 )
 async def get_live(context: OwnerContext, id: str, request: Request) -> Response:
-    """The matte for a graphics card: a few look-ups per pixel in mip-mapped textures, with S, rho and alpha.
+    """The matte for a graphics card: a few lookups per pixel in mip-mapped textures, with S, rho and alpha.
 
     It is computed for the first request and kept in the store. If the matte is still being recovered, it is that of its
     preview, and `Envmatte-Recovered` is the share of the matte that is recovered.

@@ -1,6 +1,6 @@
 // Decodes a matte for the graphics card. `workflows/composite/live/encode.py` encodes it and describes the format.
 
-const PLANES = 8; // of a look-up
+const PLANES = 8; // of a lookup
 const SPARED = 0.01; // share of the light: the finest levels of the backdrop are left out if they hold no more than this
 
 export function decodeLive(buffer) {

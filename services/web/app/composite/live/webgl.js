@@ -1,4 +1,4 @@
-// Draws the glass by WebGL2: the backdrop's light as a pyramid of textures, then a few look-ups in it for each pixel.
+// Draws the glass by WebGL2: the backdrop's light as a pyramid of textures, then a few lookups in it for each pixel.
 // `workflows/composite/live/encode.py` describes the model; light is linear until the last line of the last shader.
 
 const TRIANGLE = `#version 300 es
