@@ -37,7 +37,7 @@ from workflows.images.tone_curves import from_light
 from workflows.ingest.steps import STEPS as INGEST
 from workflows.jobs import Steps, Task, run
 from workflows.mattes.cut_out import off_sight
-from workflows.mattes.lobes import rows_of
+from workflows.mattes.lobes import transport_of
 from workflows.mattes.perspective import places_of
 from workflows.mattes.steps import STEPS as RECOVER
 from workflows.programs.presets import preset
@@ -158,7 +158,7 @@ def use_matte(objects: Objects) -> None:
         encode(picture, "srgb", dtype, threads=1)
     encode_live(matte, threads=1)
     shares = [0.01] * (len(WIDTHS) + 1)  # few captures have any glare
-    add_glare(rows_of(matte, matte.read(0, 0)), shares)
+    add_glare(transport_of(matte, matte.read(0, 0)), shares)
     patterns = lay_out(preset("sketch", *MONITOR), "linear", scaled=True)
     filter_patterns(patterns, spread_patterns(patterns), shares)
     off_sight(matte.read(0, 0), matte, np.zeros((HEIGHT, WIDTH, 2)), pitch=0.01, aspect=0.75)

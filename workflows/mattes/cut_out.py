@@ -24,7 +24,7 @@ from scipy.ndimage import (
 
 from storage.errors import Conflict
 from storage.layout.mattes import Block, Matte
-from workflows.mattes.lobes import Gridded, rows_of
+from workflows.mattes.lobes import Gridded, transport_of
 from workflows.mattes.perspective import DIRECT, LEAST, NEAR, Sight, between, find_sight, lengths, places_of
 from workflows.recovery.pyramid import Grids, Pyramid
 from workflows.threads import CORES
@@ -260,7 +260,7 @@ def off_sight(block: Block, matte: Gridded, sight: Doubles, pitch: float, aspect
     (h, w) float32
         Infinite where more than a quarter of the light comes from elsewhere.
     """
-    transport = rows_of(matte, block)
+    transport = transport_of(matte, block)
     reach = max(REACH * pitch, 2 / matte.columns)
     off = np.empty(len(transport.count), np.float32)
     grids = Pyramid.over(matte.columns, matte.rows).arrays

@@ -1,4 +1,4 @@
-"""The lobes of a block of a matte."""
+"""T of the pixels of a matte's block, and their lobes."""
 
 from typing import Any, Protocol
 
@@ -19,8 +19,8 @@ class Gridded(Protocol):
     rows: int
 
 
-def rows_of(matte: Gridded, block: Block) -> Transport:
-    """The rows of T of a block's pixels."""
+def transport_of(matte: Gridded, block: Block) -> Transport:
+    """T of a block's pixels, in the order (y, x)."""
     count, shared = block.count.reshape(-1, 3), block.shared.reshape(-1)
     return Transport(matte.columns, matte.rows, count, block.cell, block.weight, shared)
 
@@ -34,5 +34,5 @@ def block_lobes(matte: Gridded, block: Block, most: int) -> NDArray[np.float32]:
         See :func:`~workflows.recovery.clusters.lobe_table.ranked_lobes`.
     """
     width, height = matte.attributes["monitor"]
-    lobes = ranked_lobes(rows_of(matte, block), most, height / width, checkpoint)
+    lobes = ranked_lobes(transport_of(matte, block), most, height / width, checkpoint)
     return lobes.reshape(*block.recovered.shape, most, len(FIELDS))
