@@ -98,8 +98,8 @@ def test_film_without_record_asks_for_its_program(desk: Page, service: Service, 
 
 def test_stills_become_a_capture(desk: Page, service: Service, ball: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(ball) as archive:
-        record = archive.extract("capture.json", tmp_path)
-        frames = sorted(json.loads(Path(record).read_text())["frames"], key=lambda one: one["pattern"])
+        manifest = archive.extract("capture.json", tmp_path)
+        frames = sorted(json.loads(Path(manifest).read_text())["frames"], key=lambda one: one["pattern"])
         stills = [tmp_path / f"DSC_{9 + n}.PNG" for n in range(len(frames))]
         for frame, still in zip(frames, stills, strict=True):
             still.write_bytes(archive.read(frame["file"]))
@@ -108,7 +108,7 @@ def test_stills_become_a_capture(desk: Page, service: Service, ball: Path, tmp_p
         desk.goto(f"{service.url}/#/captures")
         desk.reload()
         desk.get_by_label(ZIP).set_input_files(taken)
-        desk.get_by_label("Or the capture.json that came with the program").set_input_files(record)
+        desk.get_by_label("Or the capture.json that came with the program").set_input_files(manifest)
         if taken != stills:
             expect(desk.get_by_role("alert")).to_contain_text(
                 f"shows {len(stills)} pictures, and you chose {len(taken)} stills"
@@ -175,11 +175,12 @@ def test_film_and_record_are_zipped(desk: Page, service: Service) -> None:
     desk.goto(f"{service.url}/#/captures")
     text = desk.evaluate(
         """async () => {
-            const { filmArchive, recordOf } = await import("/web/app/upload/bundle.js");
+            const { filmArchive, filmManifestOf } = await import("/web/app/upload/bundle.js");
             const showing = { border: { width: 641, height: 361 } };
-            const record = recordOf({ program: { parts: [] }, display: { width: 640, height: 360 }, showing }, 3.5);
+            const program = { program: { parts: [] }, display: { width: 640, height: 360 }, showing };
+            const manifest = filmManifestOf(program, 3.5);
             const film = new File([new Uint8Array(9e6).map((_, i) => i % 251)], "Größe.WebM", { type: "video/webm" });
-            const archive = await filmArchive(film, record);
+            const archive = await filmArchive(film, manifest);
             return new Promise((resolve) => {
                 const reader = new FileReader();
                 reader.onload = () => resolve(reader.result);
@@ -205,10 +206,10 @@ def test_film_and_record_are_zipped(desk: Page, service: Service) -> None:
 
 def test_film_of_gigabytes_is_zipped(desk: Page, service: Service, tmp_path: Path) -> None:
     """The page makes the headers only; a hole in the file stands for the film."""
-    size, record = 5 << 30, b"{}"
+    size, manifest = 5 << 30, b"{}"
     files = [
         {"name": "film.mp4", "size": size, "crc": 0},
-        {"name": "capture.json", "size": len(record), "crc": zlib.crc32(record)},
+        {"name": "capture.json", "size": len(manifest), "crc": zlib.crc32(manifest)},
     ]
     desk.goto(f"{service.url}/#/captures")
     parts = desk.evaluate(
@@ -222,12 +223,12 @@ def test_film_of_gigabytes_is_zipped(desk: Page, service: Service, tmp_path: Pat
     with (tmp_path / "film.zip").open("w+b") as file:
         file.write(bytes(parts[0]))
         file.seek(size, 1)
-        file.write(bytes(parts[1]) + record + bytes(parts[2]))
+        file.write(bytes(parts[1]) + manifest + bytes(parts[2]))
         with zipfile.ZipFile(file) as archive:
             film, entry = archive.infolist()
             assert (film.filename, film.file_size, film.compress_size) == ("film.mp4", size, size)
             assert entry.header_offset == len(parts[0]) + size
-            assert archive.read("capture.json") == record
+            assert archive.read("capture.json") == manifest
             with archive.open("film.mp4") as entry:
                 assert entry.read(4) == bytes(4)
 
@@ -236,7 +237,7 @@ def test_number_and_size_of_frames_are_sent_before_the_archive(
     desk: Page, service: Service, ball: Path, tmp_path: Path
 ) -> None:
     packed, jpeg, film = (tmp_path / name for name in ("packed.zip", "jpeg.zip", "film.zip"))
-    record = {"frames": [{"file": "ä.jpg", "pattern": 0}] * 3}
+    manifest = {"frames": [{"file": "ä.jpg", "pattern": 0}] * 3}
     parts = [
         {"kind": "constant", "levels": [0, 1]},
         {"kind": "bernoulli", "columns": 8, "rows": 6, "count": 16, "seed": 1},
@@ -245,7 +246,7 @@ def test_number_and_size_of_frames_are_sent_before_the_archive(
     with zipfile.ZipFile(ball) as source, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made:
         for name in source.namelist():
             made.writestr(name, source.read(name))
-    for path, about in ((jpeg, record), (film, filmed)):
+    for path, about in ((jpeg, manifest), (film, filmed)):
         with zipfile.ZipFile(path, "w") as made:
             made.writestr("capture.json", json.dumps(about))
             made.writestr("ä.jpg", integer_formats.encode_jpeg(np.zeros((33, 70, 3), np.uint8), 90))

@@ -60,16 +60,16 @@ def stills_archive(
 ) -> bytes:
     """The archive of a capture in linear light: one still of each pattern, and the pixels to be recovered."""
     files = {f"{n}.png": encode_png(still) for n, still in enumerate(stills)}
-    record = {
+    manifest = {
         "format": "envmatte-capture/1",
         "program": program.model_dump(mode="json"),
         "frames": [{"file": name, "pattern": n} for n, name in enumerate(files)],
         "response": "linear",
     }
     if mask is not None:
-        record["mask"] = "mask.png"
+        manifest["mask"] = "mask.png"
         files["mask.png"] = encode_png(mask[..., np.newaxis].astype(np.uint8) * 255)
-    return zip_bytes({"capture.json": json.dumps(record).encode()} | files)
+    return zip_bytes({"capture.json": json.dumps(manifest).encode()} | files)
 
 
 def zip_bytes(files: Mapping[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:

@@ -311,12 +311,12 @@ function finish(program, { width, height }, shown, refresh) {
 	const seconds = (patterns.at(-1).at - patterns[0].at) / 1000;
 	const rate = Number(((patterns.length - 1) / seconds).toFixed(4));
 	const video = { file: "film.mp4", patterns_per_second: rate, border: { width, height } };
-	const record = { format: "envmatte-capture/1", program: program.program, video };
+	const manifest = { format: "envmatte-capture/1", program: program.program, video };
 	URL.revokeObjectURL($("capture").href);
-	$("capture").href = URL.createObjectURL(new Blob([JSON.stringify(record, null, 1)], { type: "application/json" }));
+	$("capture").href = URL.createObjectURL(new Blob([JSON.stringify(manifest, null, 1)], { type: "application/json" }));
 	$("record").hidden = false;
 	setStatus(t("play.done", { n: patterns.length, rate }));
-	document.dispatchEvent(new CustomEvent("played", { detail: { shown, refresh, record } }));
+	document.dispatchEvent(new CustomEvent("played", { detail: { shown, refresh } }));
 	return rate;
 }
 

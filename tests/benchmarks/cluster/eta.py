@@ -40,10 +40,10 @@ def stills(scene: Scene) -> bytes:
 def video(scene: Scene) -> bytes:
     """A capture archive with a recording of the scene."""
     program = preset("default")
-    record, files = capture(program, film(lights(scene, program), CAMERA).data, 1 / CAMERA.hold)
+    manifest, files = capture(program, film(lights(scene, program), CAMERA).data, 1 / CAMERA.hold)
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w") as archive:
-        archive.writestr("capture.json", json.dumps(record | {"mask": "mask.png"}))
+        archive.writestr("capture.json", json.dumps(manifest | {"mask": "mask.png"}))
         archive.writestr(
             "mask.png", integer_formats.encode_png(scene.object_mask.astype(np.uint8)[..., None] * 255)
         )

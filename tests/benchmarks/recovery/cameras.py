@@ -88,7 +88,7 @@ def _archive(name: str, data: bytes) -> CaptureArchive:
         {"kind": "constant", "levels": [0, 1]},
         {"kind": "stripes", "axis": "x", "count": 1},
     ]
-    record = {
+    manifest = {
         "format": "envmatte-capture/1",
         "program": {"monitor": {"width": 4, "height": 4}, "parts": parts},
         "frames": [{"file": name, "pattern": n} for n in range(3)],
@@ -96,7 +96,7 @@ def _archive(name: str, data: bytes) -> CaptureArchive:
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w") as out:
         out.writestr(name, data)
-        out.writestr("capture.json", json.dumps(record))
+        out.writestr("capture.json", json.dumps(manifest))
     return CaptureArchive(target, LIMITS)
 
 

@@ -91,9 +91,9 @@ def measure(
     ]
     with redirect_stdout(None):
         kit.main(["video", str(scene), str(clip), *args, "--lead", str(LEAD), "--seed", str(SEED)])
-    record = json.loads(clip.with_suffix(".json").read_text()) | {"mask": "mask.png"}
+    manifest = json.loads(clip.with_suffix(".json").read_text()) | {"mask": "mask.png"}
     with zipfile.ZipFile(capture_archive, "w") as archive:
-        archive.writestr("capture.json", json.dumps(record))
+        archive.writestr("capture.json", json.dumps(manifest))
         archive.writestr("mask.png", kit.png(truth.object_pixels.astype(np.uint8) * 255))
         archive.write(clip, clip.name)
     uploaded = client.upload(capture_archive, name=f"{scene.stem} {case}")

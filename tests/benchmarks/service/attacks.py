@@ -102,13 +102,13 @@ def large_frames() -> bytes:
 
 def large_capture() -> bytes:
     """A capture with a large program, which its film does not fit: it stays as it is listed."""
-    record = {
+    manifest = {
         "format": "envmatte-capture/1",
         "program": large_program().model_dump(mode="json"),
         "video": {"file": "film.mp4", "patterns_per_second": 2},
         "response": "linear",
     }
-    return zip_bytes({"capture.json": json.dumps(record).encode(), "film.mp4": b"no film"})
+    return zip_bytes({"capture.json": json.dumps(manifest).encode(), "film.mp4": b"no film"})
 
 
 def prepare(

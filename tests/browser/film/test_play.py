@@ -197,11 +197,11 @@ def test_every_pattern_is_shown_in_order_for_its_time(tab: Page, service: Servic
     expect(link).to_be_visible()
     with tab.expect_download() as download:
         link.click()
-    record = json.loads(download.value.path().read_text())
-    assert record["video"]["border"] == SCREEN
+    manifest = json.loads(download.value.path().read_text())
+    assert manifest["video"]["border"] == SCREEN
     first, last = (times[next(i for i, (state, _) in enumerate(states) if state == n)] for n in (0, 36))
-    assert record["video"]["patterns_per_second"] == pytest.approx(36 / (last - first) * 1000, rel=0.1)
-    assert record["program"] == program["program"]
+    assert manifest["video"]["patterns_per_second"] == pytest.approx(36 / (last - first) * 1000, rel=0.1)
+    assert manifest["program"] == program["program"]
 
 
 def test_pictures_are_shown_one_by_one_for_stills(tab: Page, service: Service) -> None:

@@ -103,9 +103,9 @@ def test_film_that_needs_too_much_memory_fails_only_its_job(
     capture_archive: Path, program: Program, tmp_path: Path
 ) -> None:
     data = overstated(clip(pictures(9), even(9)), 40_000_000)  # FFmpeg would build an index of 2.8 GB
-    record, files = filmed(program, data, 2.0)
+    manifest, files = filmed(program, data, 2.0)
     bomb = tmp_path / "bomb.zip"
-    bomb.write_bytes(zipped(json.dumps(record).encode(), files))
+    bomb.write_bytes(zipped(json.dumps(manifest).encode(), files))
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_INGEST_MEMORY=str(64 << 20)) as service:
         sent = service.http.post("/v1/mattes", content=archive(tmp_path, 40, 30), headers=ZIP)
         matte = sent.json()["id"]
@@ -118,7 +118,7 @@ def test_film_that_needs_too_much_memory_fails_only_its_job(
             service.client.wait(uploaded["job"])
         assert caught.value.problem["entry"] == "clip.mp4"
         # This one allocates in small steps, and not every process can unpickle FFmpeg's own error.
-        slowly = zipped(json.dumps(record).encode(), {"clip.mp4": fragmented(4_000_000)})
+        slowly = zipped(json.dumps(manifest).encode(), {"clip.mp4": fragmented(4_000_000)})
         job = service.http.post("/v1/captures", content=slowly, headers=ZIP).json()["job"]
         # If its last step fails, FFmpeg reports damage instead.
         with pytest.raises(ServiceError, match=r"takes (more than the 384 MB|too much memory)"):

@@ -22,10 +22,10 @@ CAMERA = Camera(hold=0.25, hand=(6.0, 6.8), options={"crf": "12"})
 def uploaded(service: Service, scene: Scene, program: Program) -> dict:
     """An ingested recording of the scene, with a hand in front of it for a while."""
     made = film(lights(scene, program), CAMERA)
-    record, files = capture(program, made.data, 1 / CAMERA.hold)
+    manifest, files = capture(program, made.data, 1 / CAMERA.hold)
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w") as archive:
-        archive.writestr("capture.json", json.dumps(record | {"mask": "mask.png"}))
+        archive.writestr("capture.json", json.dumps(manifest | {"mask": "mask.png"}))
         archive.writestr("clip.mp4", files["clip.mp4"])
         archive.writestr(
             "mask.png", integer_formats.encode_png(scene.object_mask.astype(np.uint8)[..., None] * 255)
@@ -59,10 +59,10 @@ def test_a_composite_is_close_to_the_truth(service: Service, uploaded: dict, sce
 
 
 def test_recording_of_another_program_is_refused(service: Service, scene: Scene, program: Program) -> None:
-    record, files = capture(program, film(lights(scene, program)[:12], CAMERA).data, 1 / CAMERA.hold)
+    manifest, files = capture(program, film(lights(scene, program)[:12], CAMERA).data, 1 / CAMERA.hold)
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w") as archive:
-        archive.writestr("capture.json", json.dumps(record))
+        archive.writestr("capture.json", json.dumps(manifest))
         archive.writestr("clip.mp4", files["clip.mp4"])
     before = service.stored()
     made = service.http.post(

@@ -22,9 +22,9 @@ PARTS = [
 ]
 
 
-def archive(path: Path, record: Any, compression: int = zipfile.ZIP_STORED, **files: bytes) -> Path:
+def archive(path: Path, manifest: Any, compression: int = zipfile.ZIP_STORED, **files: bytes) -> Path:
     with zipfile.ZipFile(path, "w", compression) as made:
-        made.writestr("capture.json", record if isinstance(record, bytes) else json.dumps(record))
+        made.writestr("capture.json", manifest if isinstance(manifest, bytes) else json.dumps(manifest))
         for name, data in files.items():
             made.writestr(name, data)
     return path
@@ -40,24 +40,24 @@ def test_capture_declares_its_frames_and_their_size(tmp_path: Path) -> None:
 @pytest.mark.parametrize("quality", [30, 95])
 def test_size_of_a_jpeg_in_a_compressed_archive(tmp_path: Path, quality: int) -> None:
     image = integer_formats.encode_jpeg(np.zeros((33, 70, 3), np.uint8), quality)
-    record = {"frames": [{"file": "one", "pattern": 0}] * 5}
-    path = archive(tmp_path / "c.zip", record, zipfile.ZIP_DEFLATED, one=image)
+    manifest = {"frames": [{"file": "one", "pattern": 0}] * 5}
+    path = archive(tmp_path / "c.zip", manifest, zipfile.ZIP_DEFLATED, one=image)
     assert declared(path) == {"frames": 5, "width": 70, "height": 33}
 
 
 def test_film_declares_the_frames_of_its_program(tmp_path: Path) -> None:
-    record = {"program": {"parts": PARTS}, "video": {"file": "film.mp4"}}
-    assert declared(archive(tmp_path / "c.zip", record)) == {"frames": 2 + 1 + 16 + 2}
+    manifest = {"program": {"parts": PARTS}, "video": {"file": "film.mp4"}}
+    assert declared(archive(tmp_path / "c.zip", manifest)) == {"frames": 2 + 1 + 16 + 2}
 
 
-@pytest.mark.parametrize("record", [b"{", b"[]", {"frames": 3}, {}, {"program": {"parts": [{}]}}])
-def test_invalid_record_declares_nothing(tmp_path: Path, record: Any) -> None:
-    assert declared(archive(tmp_path / "c.zip", record)) == {}
+@pytest.mark.parametrize("manifest", [b"{", b"[]", {"frames": 3}, {}, {"program": {"parts": [{}]}}])
+def test_invalid_manifest_declares_nothing(tmp_path: Path, manifest: Any) -> None:
+    assert declared(archive(tmp_path / "c.zip", manifest)) == {}
 
 
 def test_image_of_unknown_format_declares_no_size(tmp_path: Path) -> None:
-    record = {"frames": [{"file": "one", "pattern": 0}]}
-    assert declared(archive(tmp_path / "c.zip", record, one=b"II*\0 and so on")) == {"frames": 1}
-    assert declared(archive(tmp_path / "d.zip", record)) == {"frames": 1}
+    manifest = {"frames": [{"file": "one", "pattern": 0}]}
+    assert declared(archive(tmp_path / "c.zip", manifest, one=b"II*\0 and so on")) == {"frames": 1}
+    assert declared(archive(tmp_path / "d.zip", manifest)) == {"frames": 1}
     (tmp_path / "e.zip").write_bytes(b"no archive")
     assert declared(tmp_path / "e.zip") == {}

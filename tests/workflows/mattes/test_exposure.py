@@ -48,14 +48,14 @@ def test_clipped_patterns_still_tell_where_light_comes_from(
     frames = [
         {"file": f"{n:03d}.png", "pattern": n, "exposure": exposure} for n, exposure in enumerate(exposures)
     ]
-    record = {
+    manifest = {
         "format": "envmatte-capture/1",
         "program": program.model_dump(mode="json", exclude_defaults=True),
         "response": "linear",
         "frames": frames,
         "mask": "mask.png",
     }
-    ingest("c", make_zip(record, files))
+    ingest("c", make_zip(manifest, files))
     task = Task("j", "c", "m", {"quality": "fast"}, Limits(1 << 30, 1 << 26))
     task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
     for tile in range(task.plan["tiles"]):

@@ -201,17 +201,17 @@ def test_frames_of_one_pattern_are_averaged(
     # Each frame is split into a darker and a lighter one; their mean is the frame.
     split = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(archives[False])) as archive, zipfile.ZipFile(split, "w") as out:
-        record = json.loads(archive.read("capture.json"))
-        frames = record["frames"]
-        record["frames"] = []
+        manifest = json.loads(archive.read("capture.json"))
+        frames = manifest["frames"]
+        manifest["frames"] = []
         for n, frame in enumerate(frames):
             pixels = decode(archive.read(frame["file"]), memory=1 << 20)
             apart = np.minimum(np.minimum(pixels - 1, 254 - pixels.astype(int)).clip(0), 1 + n % 4)
             for name, shifted in (("a", pixels - apart), ("b", pixels + apart)):
                 out.writestr(f"{n}{name}.png", encode_png(shifted.astype(np.uint8)))
-                record["frames"].append({"file": f"{n}{name}.png", "pattern": frame["pattern"]})
-        random.Random(0).shuffle(record["frames"])
-        out.writestr("capture.json", json.dumps(record))
+                manifest["frames"].append({"file": f"{n}{name}.png", "pattern": frame["pattern"]})
+        random.Random(0).shuffle(manifest["frames"])
+        out.writestr("capture.json", json.dumps(manifest))
     plain = recover(archives[False], tile=1024)[0].read(1, 1)
     doubled = recover(split.getvalue(), tile=1024)[0].read(1, 1)
     # split frames have another noise, and so S and rho other bounds
@@ -274,16 +274,16 @@ def bracketed(data: bytes, exposures: tuple[float, ...]) -> bytes:
     rng = np.random.default_rng(1)
     target = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as archive, zipfile.ZipFile(target, "w") as out:
-        record = json.loads(archive.read("capture.json"))
+        manifest = json.loads(archive.read("capture.json"))
         frames = []
-        for frame in record["frames"]:
+        for frame in manifest["frames"]:
             light = decode(archive.read(frame["file"]), memory=1 << 24) / 65535
             for exposure in exposures:
                 value = exposure * light + rng.normal(0, 0.004, light.shape)
                 name = f"{frame['pattern']}-{exposure}.png"
                 out.writestr(name, encode_png(np.rint(np.clip(value, 0, 1) * 255).astype(np.uint8)))
                 frames.append({"file": name, "pattern": frame["pattern"], "exposure": exposure / 50})
-        out.writestr("capture.json", json.dumps(record | {"frames": frames}))
+        out.writestr("capture.json", json.dumps(manifest | {"frames": frames}))
     return target.getvalue()
 
 
@@ -372,7 +372,7 @@ def test_composites_have_glare_but_no_border(
         value = seen((picture > 0).astype(np.float32)) + (amount @ border[:, n])[..., np.newaxis]
         value += 0.003 * rng.standard_normal(value.shape)
         files[f"{n}.png"] = encode_png(np.rint(np.clip(value, 0, 1) * 65535).astype(np.uint16))
-    record = {
+    manifest = {
         "format": "envmatte-capture/1",
         "program": program.model_dump(mode="json"),
         "frames": frames,
@@ -383,7 +383,7 @@ def test_composites_have_glare_but_no_border(
     backdrop = (bump * [1, 0.8, 0.5]).astype(np.float32)
     off = []
     for name, known in (("with", True), ("without", False)):
-        stack = ingest(name, make_zip(record, files))
+        stack = ingest(name, make_zip(manifest, files))
         stack.annotate(border=known and not share, glare=[0.0, 0.0, 0.0, share] if known and share else None)
         stack.save()
         off.append(error_of(name, method, backdrop, seen(backdrop), ball.object_mask))

@@ -4,7 +4,7 @@ import { camera, noCamera } from "./recorder.js";
 import { checks } from "./checklist.js";
 import { badge, duration, empty, facts, fileField, h, pause, problemBox, prose, size, when } from "../lib/dom.js";
 import { follow } from "../lib/events.js";
-import { STILLS, isFilm, isStill, programName, recordOf, stillsRecordOf, together } from "../upload/bundle.js";
+import { STILLS, filmManifestOf, isFilm, isStill, programName, stillsManifestOf, together } from "../upload/bundle.js";
 import { list } from "../lib/list.js";
 import { FILM, staying, steps } from "../lib/view.js";
 import { countScreen, isPhone, onZoom } from "./screen.js";
@@ -81,7 +81,7 @@ export async function program(main, signal, id) {
 	const problem = h("div");
 	const live = h("section.panel", h("h2", t("film.on")), phase, bar, about,
 		h("p.row", h("a.primary", { href: `v1/programs/${id}/play`, target: "_blank", rel: "opener" }, t("film.play"))));
-	const film = (file, about) => begin(file, recordOf(found, found.showing?.patterns_per_second ?? 2), { again: `#/film/${id}`, ...about });
+	const film = (file, about) => begin(file, filmManifestOf(found, found.showing?.patterns_per_second ?? 2), { again: `#/film/${id}`, ...about });
 	// The player starts when it learns that a countdown has begun, and then reports its own.
 	const startPlayer = () => putJson(`v1/programs/${id}/showing`, { phase: "countdown", patterns_per_second: found.showing?.patterns_per_second ?? 2, seconds: COUNTDOWN });
 	const why = noCamera();
@@ -89,7 +89,7 @@ export async function program(main, signal, id) {
 	const take = ([file, ...more]) => {
 		problem.replaceChildren();
 		if (isFilm(file)) film(file);
-		else if (more.length && isStill(file)) begin(together([file, ...more]), stillsRecordOf(found));
+		else if (more.length && isStill(file)) begin(together([file, ...more]), stillsManifestOf(found));
 		else problem.replaceChildren(problemBox({ title: t("film.none"), detail: t("film.type", { name: file.name, type: file.type || t("film.unknown") }) }));
 	};
 	const choose = fileField({ accept: `video/*,${STILLS}`, id: "film", multiple: true }, take);

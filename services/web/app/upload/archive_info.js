@@ -3,7 +3,7 @@ const END = 0x06054b50; // signatures of APPNOTE, sect. 4.3
 const ENTRY = 0x02014b50;
 const TAIL = 22 + 65535; // bytes in which the end of the directory begins
 const FULL = 2 ** 32 - 1; // stands for a 64-bit number that is stored elsewhere
-const RECORD = "capture.json";
+const MANIFEST = "capture.json";
 const MOST = 8 << 20; // bytes of that file
 const HEAD = 1 << 16; // bytes of an image that contain its size
 const PNG = 0x89504e47; // first bytes of images
@@ -53,11 +53,11 @@ export async function readArchiveInfo(file) {
 	const info = {};
 	try {
 		const found = await entries(file);
-		if (found[RECORD].size > MOST) return info;
-		const record = JSON.parse(await (await read(file, found[RECORD])).text());
-		info.frames = record.frames?.length || countPatterns(record.program);
-		if (record.frames?.length) {
-			const image = await read(file, found[record.frames[0].file]);
+		if (found[MANIFEST].size > MOST) return info;
+		const manifest = JSON.parse(await (await read(file, found[MANIFEST])).text());
+		info.frames = manifest.frames?.length || countPatterns(manifest.program);
+		if (manifest.frames?.length) {
+			const image = await read(file, found[manifest.frames[0].file]);
 			Object.assign(info, sizeOf(await view(image.slice(0, HEAD))));
 		}
 	} catch {}

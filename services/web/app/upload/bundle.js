@@ -18,18 +18,18 @@ export const isStill = (file) => file.type.startsWith("image/") || STILL_ENDS.te
 export const programName = (program) => t(program.display ? "program.screen" : "program.plain", { n: program.patterns, size: size(program.display ?? {}) });
 
 // The capture.json of a film of a program, shown by the player page or as a video.
-export function recordOf(program, rate) {
+export function filmManifestOf(program, rate) {
 	const border = program.showing?.border ?? program.display;
 	const video = { patterns_per_second: rate, ...(border && { border }) };
-	return { ...stillsRecordOf(program), video };
+	return { ...stillsManifestOf(program), video };
 }
 
-export const stillsRecordOf = ({ program }) => ({ format: "envmatte-capture/1", program });
+export const stillsManifestOf = ({ program }) => ({ format: "envmatte-capture/1", program });
 
-export async function filmArchive(film, record, signal) {
+export async function filmArchive(film, manifest, signal) {
 	const file = `film${ENDS.exec(film.name)?.[0].toLowerCase() ?? ".mp4"}`;
-	const name = record.name || film.name.replace(/\.\w+$/, "").slice(0, 200);
-	const text = JSON.stringify({ ...record, name, video: { ...record.video, file } });
+	const name = manifest.name || film.name.replace(/\.\w+$/, "").slice(0, 200);
+	const text = JSON.stringify({ ...manifest, name, video: { ...manifest.video, file } });
 	return zip([["capture.json", new Blob([text])], [file, film]], signal);
 }
 
@@ -66,18 +66,18 @@ function inOrder(stills) {
 	return { stills: [...stills.slice(gap), ...stills.slice(0, gap)], note: t("stills.rolled", { first: first.name, last: last.name }) };
 }
 
-export async function stillsArchive({ stills }, { video, mask, ...record }, signal) {
-	const patterns = countPatterns(record.program);
+export async function stillsArchive({ stills }, { video, mask, ...manifest }, signal) {
+	const patterns = countPatterns(manifest.program);
 	if (stills.length !== patterns) throw new Problem({ status: 422, title: t("upload.none"), detail: t("stills.count", { n: stills.length, patterns }) });
-	const name = record.name || stills[0].name.replace(/\.\w+$/, "").slice(0, 200);
+	const name = manifest.name || stills[0].name.replace(/\.\w+$/, "").slice(0, 200);
 	// The report names files as the photographer knows them, but not every character may be in an archive.
 	const frames = stills.map((still, pattern) => ({ file: `${String(pattern).padStart(5, "0")}/${still.name.replace(/[^\w .()+-]/g, "_")}`, pattern }));
-	const text = JSON.stringify({ ...record, name, frames });
+	const text = JSON.stringify({ ...manifest, name, frames });
 	return zip([["capture.json", new Blob([text])], ...frames.map(({ file }, n) => [file, stills[n]])], signal);
 }
 
 // Asks in `where` which program a film or stills show; resolves with their capture.json.
-export async function askForRecord(where, isFilmed, signal) {
+export async function askForManifest(where, isFilmed, signal) {
 	const { programs } = await getJson("v1/programs?limit=100", signal);
 	return new Promise((resolve, reject) => {
 		signal.addEventListener("abort", () => reject(signal.reason), { once: true });
@@ -91,11 +91,11 @@ export async function askForRecord(where, isFilmed, signal) {
 		own.onchange = async () => {
 			try {
 				const found = JSON.parse(await own.files[0].text());
-				if (isFilmed && !found.video?.patterns_per_second) throw new Error(t("record.novideo"));
-				if (!found.program?.parts) throw new Error(t("record.noprogram"));
+				if (isFilmed && !found.video?.patterns_per_second) throw new Error(t("manifest.novideo"));
+				if (!found.program?.parts) throw new Error(t("manifest.noprogram"));
 				resolve(found);
 			} catch (error) {
-				problem.textContent = t("record.wrong", { why: error.message });
+				problem.textContent = t("manifest.wrong", { why: error.message });
 				own.value = "";
 			}
 		};
@@ -107,7 +107,7 @@ export async function askForRecord(where, isFilmed, signal) {
 			h("label", t("program.own"), own), problem);
 		form.onsubmit = (event) => {
 			event.preventDefault();
-			getJson(`v1/programs/${programs[which.value].id}`, signal).then((program) => resolve(isFilmed ? recordOf(program, Number(rate.value)) : stillsRecordOf(program)), reject);
+			getJson(`v1/programs/${programs[which.value].id}`, signal).then((program) => resolve(isFilmed ? filmManifestOf(program, Number(rate.value)) : stillsManifestOf(program)), reject);
 		};
 		where.replaceChildren(form);
 		(programs.length ? which : own).focus();

@@ -2,7 +2,7 @@
 import { Problem, ask, newKey, post, saveBlob } from "../lib/api.js";
 import { recordings } from "../lib/recordings.js";
 import { bytes, confirmed, duration, fileField, h, problemBox, when } from "../lib/dom.js";
-import { STILLS, askForRecord, filmArchive, isFilm, isStill, stillsArchive, together } from "./bundle.js";
+import { STILLS, askForManifest, filmArchive, isFilm, isStill, stillsArchive, together } from "./bundle.js";
 import { forgetFilm, keepFilm, noteCapture, waitingFilms } from "./kept_films.js";
 import { send } from "./tus.js";
 import { crc32 } from "./zip.js";
@@ -20,8 +20,8 @@ addEventListener("beforeunload", (event) => [...rows].some(({ busy, unsaved }) =
 // filmed in the view `again`. One that was recorded here has an `id`: it can be saved, is kept until its capture is ready,
 // and is discarded only after a question. One with a `warning`, and stills with a `note`, wait for the user; one that is
 // `stored` is kept already.
-export function begin(file, record, { again: view = "#/film", id, at = Date.now(), warning = "", stored = false } = {}) {
-	const film = { id, at, file, record, again: view, warning };
+export function begin(file, manifest, { again: view = "#/film", id, at = Date.now(), warning = "", stored = false } = {}) {
+	const film = { id, at, file, record: manifest, again: view, warning }; // as browsers keep it
 	const state = { busy: false, unsaved: Boolean(id) && !stored };
 	let saved = !id;
 	if (state.unsaved) keepFilm(film).then((isKept) => (state.unsaved &&= !isKept));
@@ -61,9 +61,9 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 		try {
 			if (!archive) {
 				status.textContent = t(file.stills ? "stills" : "upload.film");
-				record ??= await askForRecord(asked, isFilm(file), stop.signal);
+				manifest ??= await askForManifest(asked, isFilm(file), stop.signal);
 				status.textContent = t("upload.zipping");
-				archive = await (file.stills ? stillsArchive : filmArchive)(file, record, stop.signal);
+				archive = await (file.stills ? stillsArchive : filmArchive)(file, manifest, stop.signal);
 			} else {
 				const head = await headOf(archive);
 				if (!/^PK[\x03\x05]/.test(head)) throw new Problem({ status: 422, title: t("upload.none"), detail: t("upload.neither", { name: file.name }) });
@@ -74,7 +74,7 @@ export function begin(file, record, { again: view = "#/film", id, at = Date.now(
 				}
 			}
 			// A film or stills with another capture.json are another archive.
-			remembered ??= `envmatte-upload ${file.name} ${archive.size} ${file.lastModified} ${record ? await crc32(archive.slice(0, HEAD)) : ""}`;
+			remembered ??= `envmatte-upload ${file.name} ${archive.size} ${file.lastModified} ${manifest ? await crc32(archive.slice(0, HEAD)) : ""}`;
 			const upload = await send(archive, remembered, {
 				filename: file.name,
 				signal: stop.signal,
