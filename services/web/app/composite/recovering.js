@@ -6,7 +6,7 @@ import { followJob } from "../lib/job_progress.js";
 import { showAgain } from "../lib/view.js";
 import { t } from "../lib/words.js";
 
-const LOOK = 3000; // ms between two pictures
+const POLL = 3000; // ms between two pictures
 const LEAST = 4; // pixels that are dragged for a rectangle
 
 // `done` is called once all of the matte is there.
@@ -17,7 +17,7 @@ export function recovering(matte, stage, signal, done) {
 	const progress = h("div");
 	const look = newest(async () => {
 		stage.renew();
-		await pause(LOOK, signal).catch(() => {});
+		await pause(POLL, signal).catch(() => {});
 	});
 	followJob(progress, matte.job, signal, (job) => {
 		halt.update(job);

@@ -5,7 +5,7 @@ import { ACTIVE } from "./events.js";
 import { qualityOf } from "./view.js";
 import { known, said, t } from "./words.js";
 
-const REFRESH = 4000; // ms
+const POLL = 4000; // ms between two requests
 const SHOWN = 8;
 const menu = document.getElementById("activities");
 const entries = menu.firstElementChild;
@@ -32,7 +32,7 @@ export const refreshActivity = newest(async () => {
 		if (focused) menu.querySelector(`[href="${focused}"]`)?.focus();
 		if (!active && !isOpen) return;
 	}
-	if (jobs || isOpen || (isTemporary && count.textContent)) timer = setTimeout(refreshActivity, REFRESH);
+	if (jobs || isOpen || (isTemporary && count.textContent)) timer = setTimeout(refreshActivity, POLL);
 });
 
 menu.addEventListener("toggle", ({ newState }) => {

@@ -4,7 +4,7 @@ import { ACTIVE, follow } from "./events.js";
 import { badge, duration, facts, h, newest, pause, problemBox } from "./dom.js";
 import { known, locale, said, t } from "./words.js";
 
-const LOG_EVERY = 2000; // ms
+const POLL = 2000; // ms between two requests for the log
 const TICK = 1000; // ms
 
 // Fills `panel` and follows a job to its end; resolves with its last state. `changed` gets every state, the `known` first.
@@ -27,7 +27,7 @@ export async function followJob(panel, id, signal, changed = () => {}, known = n
 			lines.append(...found.map(({ at, text }) => h("li", h("time", { datetime: at }, new Date(at).toLocaleTimeString(locale())), " ", said(text))));
 			last = found.at(-1)?.line ?? last;
 			if (atEnd) lines.scrollTop = lines.scrollHeight;
-			if (!ended) await pause(LOG_EVERY, signal);
+			if (!ended) await pause(POLL, signal);
 		} catch {} // the next event reads it again
 	});
 

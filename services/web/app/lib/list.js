@@ -5,7 +5,7 @@ import { button, empty, h, newest, pause, problemBox } from "./dom.js";
 import { deleteLater } from "./undo.js";
 import { t } from "./words.js";
 
-const REFRESH = 5000; // ms
+const POLL = 5000; // ms between two requests
 const PAGE = 50; // entries
 
 // `kind` names a path of the API and the key of its answer. `item` makes the card of an entry, and `text` says which one
@@ -125,7 +125,7 @@ export async function list(main, signal, { kind, states = [], named = false, bus
 	// Tries again what failed. Refreshes the first page only, and only while no further page is shown.
 	async function watch() {
 		for (;;) {
-			await pause(REFRESH, signal);
+			await pause(POLL, signal);
 			if (document.hidden || more.disabled) continue;
 			if (failed?.error.isTemporary) await load(failed.isMore);
 			else if (entries.length <= PAGE && entries.some(busy)) await load();

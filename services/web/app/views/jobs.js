@@ -12,7 +12,7 @@ import { automatic } from "./recovery_form.js";
 import { reportLink } from "./report.js";
 import { t } from "../lib/words.js";
 
-const REFRESH = 2000; // ms between two pictures of what is recovered
+const POLL = 2000; // ms between two pictures of what is recovered
 const LONGER = 640; // pixels of their longer side, at most
 
 const isActive = ({ state }) => ACTIVE.includes(state);
@@ -113,9 +113,9 @@ async function progressPicture(found, signal) {
 		try {
 			await show(image, await getComposite(now.matte, { size }, "image/png", await before, signal));
 			shown = next;
-			if (now.state === "running") await pause(REFRESH, signal);
+			if (now.state === "running") await pause(POLL, signal);
 		} catch {
-			await pause(REFRESH, signal).catch(() => {}); // nothing recovered yet, or the service is away, which the progress panel shows
+			await pause(POLL, signal).catch(() => {}); // nothing recovered yet, or the service is away, which the progress panel shows
 		}
 	});
 	return {

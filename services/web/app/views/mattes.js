@@ -13,7 +13,7 @@ import { sharing } from "./sharing.js";
 import { renamable } from "../lib/rename.js";
 
 const THUMB = 240; // pixels
-const LOOK = 3000; // ms between two looks for a picture
+const POLL = 3000; // ms between two looks for a picture
 const checker = backdrop("Checker", THUMB, 180);
 
 export function matteCards(signal) {
@@ -80,7 +80,7 @@ export async function matte(main, signal, id) {
 // Shows the view again once there is something to see, or there will be nothing.
 async function awaitPicture({ id, state }, signal) {
 	for (let now = { state }; now.state === state && !now.preview; ) {
-		await pause(LOOK, signal);
+		await pause(POLL, signal);
 		now = await getJson(`v1/mattes/${id}`, signal).catch((error) => (error.isTemporary ? { state } : {}));
 	}
 	signal.throwIfAborted();
