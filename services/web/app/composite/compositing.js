@@ -11,7 +11,7 @@ import { handleGestures, placement } from "./placement.js";
 import { NAMES, scenery } from "./backdrops/scenery.js";
 import { Stage } from "./stage.js";
 import { cameraSymbol, choice, thumbOf, thumbs } from "./backdrops/thumb_choices.js";
-import { camera, clip } from "./backdrops/video_backdrops.js";
+import { cameraBackdrop, clipBackdrop } from "./backdrops/video_backdrops.js";
 import { parts, t } from "../lib/words.js";
 import { recordButton } from "./recording.js";
 
@@ -93,12 +93,12 @@ export function compositing(matte, others, signal) {
 // makes composites.
 function backdropChoices(matte, stage, use, all, first, signal) {
 	const builtIns = NAMES.map((name) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, name === first, (control) => use(builtIn(name, matte.monitor), control)));
-	const choices = thumbs(t("backdrop"), [...builtIns, choice("backdrop", t("camera"), cameraSymbol(), false, (control) => use(camera(), control))]);
+	const choices = thumbs(t("backdrop"), [...builtIns, choice("backdrop", t("camera"), cameraSymbol(), false, (control) => use(cameraBackdrop(), control))]);
 	let own; // the choice of the last file
 	const take = async (files) => {
 		if (files.length > 1) return all([...files]);
 		const [file] = files;
-		const open = () => (isFilm(file) ? clip(file) : fromFile(file));
+		const open = () => (isFilm(file) ? clipBackdrop(file) : fromFile(file));
 		const place = h("span");
 		const next = choice("backdrop", file.name || t("backdrop.pasted"), place, false, (control) => use(open(), control));
 		const control = next.querySelector("input");

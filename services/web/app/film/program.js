@@ -1,6 +1,6 @@
 // Filming: the choice of a program, and one program with its checklist, its progress on the monitor, and its film.
 import { elsewhere, getJson, newKey, post, putJson } from "../lib/api.js";
-import { camera, noCamera } from "./recorder.js";
+import { cameraPanel, noCamera } from "./recorder.js";
 import { checks } from "./checklist.js";
 import { badge, duration, empty, facts, fileField, h, pause, problemBox, prose, size, when } from "../lib/dom.js";
 import { follow } from "../lib/events.js";
@@ -85,7 +85,7 @@ export async function program(main, signal, id) {
 	// The player starts when it learns that a countdown has begun, and then reports its own.
 	const startPlayer = () => putJson(`v1/programs/${id}/showing`, { phase: "countdown", patterns_per_second: found.showing?.patterns_per_second ?? 2, seconds: COUNTDOWN });
 	const why = noCamera();
-	const recorder = why ? null : camera(signal, (file, whole) => film(file, { id: newKey(), warning: whole ? "" : t("film.cut") }), startPlayer);
+	const recorder = why ? null : cameraPanel(signal, (file, whole) => film(file, { id: newKey(), warning: whole ? "" : t("film.cut") }), startPlayer);
 	const take = ([file, ...more]) => {
 		problem.replaceChildren();
 		if (isFilm(file)) film(file);

@@ -17,7 +17,7 @@ export function noCamera() {
 
 // A panel to record with. `filmed(file, whole)` is called with every film, `ready` when all is well before one; call `resume`
 // when the panel is shown again.
-export function camera(signal, filmed, ready) {
+export function cameraPanel(signal, filmed, ready) {
 	const picture = h("video", { muted: true, playsinline: true, "aria-label": t("camera.sees") });
 	const frame = h("div.picture", { hidden: true }, picture);
 	const status = h("p.hint", { role: "status" });

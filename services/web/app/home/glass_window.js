@@ -1,7 +1,7 @@
 // A live glass that fills the window: a canvas under it shows what is around it.
 import { LiveGlass } from "../composite/live/live_glass.js";
 import { h } from "../lib/dom.js";
-import { fetchSample, still, titleOf } from "./samples.js";
+import { fetchSample, pictureOf, titleOf } from "./samples.js";
 import { t } from "../lib/words.js";
 
 const FREE = 0.9; // share of the frame's shorter side that has to fit into the window
@@ -32,7 +32,7 @@ export class GlassWindow extends LiveGlass {
 	// Shows a sample; of several, the one that was chosen last.
 	async show(sample) {
 		const choice = (this.#choices += 1);
-		this.#still.src = still(sample);
+		this.#still.src = pictureOf(sample);
 		this.#still.alt = t("home.board", { glass: titleOf(sample) });
 		this.canvas.ariaLabel = t("home.before", { glass: titleOf(sample) });
 		const found = this.gl ? await this.#fetch(sample, () => choice === this.#choices) : null;

@@ -4,10 +4,10 @@ import { fromFile } from "../composite/backdrops/backdrops.js";
 import { scenery } from "../composite/backdrops/scenery.js";
 import { cameraSymbol, choice, fileSymbol, thumbOf, thumbs } from "../composite/backdrops/thumb_choices.js";
 import { handleGestures, placement } from "../composite/placement.js";
-import { camera } from "../composite/backdrops/video_backdrops.js";
+import { cameraBackdrop } from "../composite/backdrops/video_backdrops.js";
 import { fileInput, onDrop, upload } from "../upload/upload.js";
 import { GlassWindow } from "./glass_window.js";
-import { aboutOf, areRemoved, fetchSamples, removeSamples, still, titleOf } from "./samples.js";
+import { aboutOf, areRemoved, fetchSamples, pictureOf, removeSamples, titleOf } from "./samples.js";
 import { t } from "../lib/words.js";
 
 const SCENES = ["Dusk", "Lights", "Tiles"];
@@ -46,13 +46,13 @@ export async function home(main, signal) {
 	}
 	const drawn = (name) => Promise.resolve(scenery(name, ...samples[0].monitor));
 	const backdrops = SCENES.map((name, i) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, i === 0, (control) => use(drawn(name), control)));
-	backdrops.push(choice("backdrop", t("home.camera"), cameraSymbol(), false, (control) => use(camera(), control)));
+	backdrops.push(choice("backdrop", t("home.camera"), cameraSymbol(), false, (control) => use(cameraBackdrop(), control)));
 	// A file is no choice before it is chosen: then a radio button that nobody sees marks it.
 	const isOwn = h("input", { type: "radio", name: "backdrop", hidden: true });
 	const frame = h("span.frame", fileSymbol());
 	backdrops.push(h("label.thumb-choice", fileField({ accept: "image/*", title: "" }, take), isOwn, frame, h("span", t("page.own"))));
 	const glasses = samples.map((sample, i) =>
-		choice("sample", titleOf(sample), h("img", { src: still(sample), alt: "", width: 96, height: 72, draggable: "false" }), i === 0, () => show(sample)));
+		choice("sample", titleOf(sample), h("img", { src: pictureOf(sample), alt: "", width: 96, height: 72, draggable: "false" }), i === 0, () => show(sample)));
 
 	async function take(files) {
 		if (files.length > 1 || !files[0].type.startsWith("image/")) return upload(files);

@@ -12,7 +12,7 @@ export const restoreSamples = () => localStorage.removeItem(REMOVED);
 
 export const titleOf = ({ name, title }) => known(`sample.${name}`, title);
 export const aboutOf = ({ name, about }) => known(`sample.${name}.about`, about);
-export const still = ({ name }) => `${FOLDER}${name}.webp`;
+export const pictureOf = ({ name }) => `${FOLDER}${name}.webp`;
 
 // Fetches a file of the app itself, which needs no key.
 async function fetchFile(name, signal) {

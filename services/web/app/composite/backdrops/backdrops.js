@@ -51,13 +51,13 @@ export async function fromFile(file) {
 		whole.close();
 	}
 	let small;
-	const shot = (longest, type) => still(picture, picture.width, picture.height, longest, type);
+	const shot = (longest, type) => snapshot(picture, picture.width, picture.height, longest, type);
 	const quick = async () => (small ??= await shot(PREVIEW, "image/jpeg"));
 	return { name, exact, quick, picture, copy: () => shot(DRAWABLE, "image/png"), close: () => picture.close() };
 }
 
 // The picture, or a video's current frame, no larger than `longest`; black where transparent, as in the service.
-export function still(picture, width, height, longest, type) {
+export function snapshot(picture, width, height, longest, type) {
 	const much = Math.min(1, longest / Math.max(width, height));
 	const canvas = canvasOf(Math.max(1, Math.round(width * much)), Math.max(1, Math.round(height * much)));
 	const context = canvas.getContext("2d");

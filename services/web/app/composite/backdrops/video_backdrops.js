@@ -1,12 +1,12 @@
 // Moving backdrops: the camera of this device, and clips.
 import { Problem } from "../../lib/api.js";
 import { openCamera } from "../../lib/recordings.js";
-import { PREVIEW, still } from "./backdrops.js";
+import { PREVIEW, snapshot } from "./backdrops.js";
 import { t } from "../../lib/words.js";
 
 const WHOLE = 1920; // pixels of the longer side of a frame that is sent as a still
 
-export async function camera() {
+export async function cameraBackdrop() {
 	if (!navigator.mediaDevices) {
 		throw new Problem({ title: t("camera.failed"), detail: t("camera.https") });
 	}
@@ -18,7 +18,7 @@ export async function camera() {
 	});
 }
 
-export async function clip(file) {
+export async function clipBackdrop(file) {
 	const url = URL.createObjectURL(file);
 	try {
 		return { ...(await played(file.name, (video) => (video.src = url), () => URL.revokeObjectURL(url))), clip: file };
@@ -41,7 +41,7 @@ async function played(name, load, close) {
 	await ready;
 	if (!video.videoWidth) throw new Error(t("clip.empty"));
 	await video.play();
-	const shot = (longest, type) => () => still(video, video.videoWidth, video.videoHeight, longest, type);
+	const shot = (longest, type) => () => snapshot(video, video.videoWidth, video.videoHeight, longest, type);
 	return {
 		name, picture: video, moving: video, exact: shot(WHOLE, "image/png"), quick: shot(PREVIEW, "image/jpeg"),
 		close() {

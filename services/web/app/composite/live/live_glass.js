@@ -3,7 +3,7 @@
 import { Coarseness } from "./coarseness.js";
 import { createPainter, webglContext } from "./webgl.js";
 
-const STILL = 300; // ms without a change after which it `rested`
+const REST = 300; // ms without a change after which it `rested`
 
 export class LiveGlass {
 	#painter;
@@ -76,7 +76,7 @@ export class LiveGlass {
 	// Draws again after the placement, the backdrop or the window has changed.
 	moved() {
 		clearTimeout(this.#timer);
-		if (!this.playing) this.#timer = setTimeout(() => (this.#coarseness?.rest(), this.rested()), STILL);
+		if (!this.playing) this.#timer = setTimeout(() => (this.#coarseness?.rest(), this.rested()), REST);
 		this.request();
 	}
 
