@@ -145,7 +145,7 @@ def test_what_is_done_to_stills_is_said_before(
     expect(desk.get_by_label("Or the capture.json that came with the program")).to_be_attached()
     stills = desk.evaluate(
         """async (names) => {
-            const { together } = await import("/web/app/upload/bundle.js");
+            const { together } = await import("/web/app/upload/archive.js");
             const files = names.map((name) => new File([], name, { lastModified: 1 }));
             return together(files).stills.map(({ name }) => name);
         }""",
@@ -159,7 +159,7 @@ def test_numbers_out_of_the_order_of_time_stay(desk: Page, service: Service) -> 
     desk.goto(f"{service.url}/#/captures")
     expect(desk.get_by_role("heading", name="Captures")).to_be_visible()
     in_order = """async (stills) => {
-        const { together } = await import("/web/app/upload/bundle.js");
+        const { together } = await import("/web/app/upload/archive.js");
         const files = stills.map(([name, lastModified]) => new File([], name, { lastModified }));
         return together(files).stills.map(({ name }) => name);
     }"""
@@ -175,7 +175,7 @@ def test_film_and_record_are_zipped(desk: Page, service: Service) -> None:
     desk.goto(f"{service.url}/#/captures")
     text = desk.evaluate(
         """async () => {
-            const { filmArchive, filmManifestOf } = await import("/web/app/upload/bundle.js");
+            const { filmArchive, filmManifestOf } = await import("/web/app/upload/archive.js");
             const showing = { border: { width: 641, height: 361 } };
             const program = { program: { parts: [] }, display: { width: 640, height: 360 }, showing };
             const manifest = filmManifestOf(program, 3.5);

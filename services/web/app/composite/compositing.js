@@ -1,6 +1,6 @@
 // The stage of a matte, and its controls.
 import { fileField, h } from "../lib/dom.js";
-import { STILLS, isFilm } from "../upload/bundle.js";
+import { STILLS, isFilm } from "../upload/archive.js";
 import { onDrop } from "../upload/upload.js";
 import { builtIn, fromFile } from "./backdrops/backdrops.js";
 import { clipJob } from "./clip_job.js";

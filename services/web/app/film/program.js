@@ -4,7 +4,7 @@ import { cameraPanel, noCamera } from "./recorder.js";
 import { checks } from "./checklist.js";
 import { badge, duration, empty, facts, fileField, h, pause, problemBox, prose, size, when } from "../lib/dom.js";
 import { follow } from "../lib/events.js";
-import { STILLS, filmManifestOf, isFilm, isStill, programName, stillsManifestOf, together } from "../upload/bundle.js";
+import { STILLS, filmManifestOf, isFilm, isStill, programName, stillsManifestOf, together } from "../upload/archive.js";
 import { list } from "../lib/list.js";
 import { FILM, staying, steps } from "../lib/view.js";
 import { countScreen, isPhone, onZoom } from "./screen.js";

@@ -2,7 +2,7 @@
 import { Problem, ask, newKey, post, saveBlob } from "../lib/api.js";
 import { recordings } from "../lib/recordings.js";
 import { bytes, confirmed, duration, fileField, h, problemBox, when } from "../lib/dom.js";
-import { STILLS, askForManifest, filmArchive, isFilm, isStill, stillsArchive, together } from "./bundle.js";
+import { STILLS, askForManifest, filmArchive, isFilm, isStill, stillsArchive, together } from "./archive.js";
 import { forgetFilm, keepFilm, noteCapture, waitingFilms } from "./kept_films.js";
 import { send } from "./tus.js";
 import { crc32 } from "./zip.js";
