@@ -45,7 +45,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_film_with_its_record_becomes_a_capture(desk: Page, service: Service, clip: Path) -> None:
+def test_film_with_its_manifest_becomes_a_capture(desk: Page, service: Service, clip: Path) -> None:
     desk.add_init_script(BY_HAND)
     desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(clip)
@@ -73,7 +73,7 @@ def test_archive_of_a_matte_comes_back_as_a_matte(
     assert service.client.matte(matte).capture is None
 
 
-def test_film_without_record_asks_for_its_program(desk: Page, service: Service, clip: Path) -> None:
+def test_film_without_manifest_asks_for_its_program(desk: Page, service: Service, clip: Path) -> None:
     made = service.http.post(
         "/v1/programs", json={"preset": "sketch", "monitor": {"width": 800, "height": 450}, "border": True}
     ).json()
@@ -171,7 +171,7 @@ def test_numbers_out_of_the_order_of_time_stay(desk: Page, service: Service) -> 
         assert desk.evaluate(in_order, stills) == [name for name, _ in stills]
 
 
-def test_film_and_record_are_zipped(desk: Page, service: Service) -> None:
+def test_film_and_manifest_are_zipped(desk: Page, service: Service) -> None:
     desk.goto(f"{service.url}/#/captures")
     text = desk.evaluate(
         """async () => {

@@ -258,7 +258,7 @@ def test_invalid_patterns_are_refused(
 
 
 @pytest.mark.slow
-def test_film_of_a_preset_and_of_its_record(tmp_path: Path) -> None:
+def test_film_of_a_preset_and_of_its_manifest(tmp_path: Path) -> None:
     film = tmp_path / "new" / "sketch.mp4"
     done = patterns("sketch", str(film), "--monitor", "320x240", "--rate", "10", "--json")
     assert done.returncode == 0, done.stderr

@@ -67,7 +67,7 @@ def test_program_that_cannot_be_fitted_to_a_screen_is_refused() -> None:
         fit_to_screen(Program.model_validate(images), None, bordered=False)
 
 
-def test_an_archive_has_the_record_and_every_picture() -> None:
+def test_an_archive_has_the_manifest_and_every_picture() -> None:
     parts = list(zip_program(SKETCH))
     assert max(map(len, parts)) < 12_000  # of one picture each, and at the end the directory
     assert b"".join(zip_program(SKETCH)) == b"".join(parts)

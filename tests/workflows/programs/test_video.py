@@ -72,7 +72,7 @@ def test_every_picture_is_shown_for_its_time(
     assert start == pytest.approx(2 * sum(LEAD_SECONDS) + program.count / rate, abs=10 * spacing)
 
 
-def test_record_beside_the_video_is_a_valid_capture_json(tmp_path: Path) -> None:
+def test_manifest_beside_the_video_is_a_valid_capture_json(tmp_path: Path) -> None:
     write_video(COLOURED, tmp_path / "sketch.mp4", 3.0, lambda done, of: None)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sketch.json", "sketch.mp4"]
     record = json.loads((tmp_path / "sketch.json").read_text())

@@ -1,6 +1,6 @@
 // The language of the app: that of the browser, or the one that was chosen here. Only its words are loaded.
 import { h } from "./dom.js";
-import { LANGUAGES, learn, locale, preferred, speak, t } from "./words.js";
+import { LANGUAGES, learn, locale, preferred, speak } from "./words.js";
 
 const SERVICE = "en"; // the language that the service speaks
 const KEPT = "envmatte-language"; // in this browser's storage
