@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from workflows.recovery.camera.noise import MEDIAN_TO_SIGMA
 from workflows.recovery.pyramid import Grids, Pyramid, bump_variance, halve_codes
 from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import LEAST_WEIGHT, Transport
@@ -23,6 +24,8 @@ WIDTHS = (1 / 96, 1 / 32, 1 / 10)
 LEAST = 0.01
 """Glare that takes a smaller share of the light is left out."""
 
+# Standard deviations beyond which a residual gets less weight.
+_HUBER = 1.5
 # Rows of cells whose patterns are filtered at a time.
 _ROWS = 8
 # Nodes of a Gaussian are as far apart as it allows: its smallest standard deviation in their spacings.
@@ -119,7 +122,9 @@ def fit_shares(
         root = np.linalg.cholesky(gram + 1e-9 * (np.trace(gram) + 1e-9) * np.eye(len(gram)))
         shares, _ = nnls(root.T, np.linalg.solve(root, design.T @ target))
         left = np.abs(residual - parts @ shares) * scale
-        scale = scale * np.sqrt(np.minimum(1, 1.5 * 1.4826 * np.median(left) / np.maximum(left, 1e-12)))
+        scale = scale * np.sqrt(
+            np.minimum(1, _HUBER * MEDIAN_TO_SIGMA * np.median(left) / np.maximum(left, 1e-12))
+        )
     return shares
 
 
@@ -229,6 +234,11 @@ def _add_to_rows(
     whole: NDArray[np.int64],
     shares: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    """The entries of each row of T with those of its glare: counts of the rows, nodes and weights.
+
+    `x` and `y`, (nodes,), are the centres of the pyramid's nodes, `sigma` the Gaussians' widths in cells, and `whole`
+    the nodes that are the whole monitor.
+    """
     columns, rows, starts = grids
     new_count, own = np.zeros_like(count), 1 - shares.sum()
     out, out_weight, end = np.empty(4 * node.size + 1, np.int64), np.empty(4 * node.size + 1, np.float32), 0

@@ -14,6 +14,7 @@ from workflows.ingest.measured_light import exposures_of
 from workflows.ingest.video.resemblance import GRIDS, MIN_PATTERNS, lay_out
 from workflows.programs.parts import Bernoulli
 from workflows.programs.program import Program
+from workflows.recovery.camera.noise import MEDIAN_TO_SIGMA
 
 PLACES = 400
 """Blocks of the frame that are compared, at most,"""
@@ -151,7 +152,7 @@ def find_odd(seen: Floats, patterns: Integers, cells: Floats, parts: Sequence[In
         own = alike[at : at + len(frames)]
         at += len(frames)
         typical = float(np.median(own))
-        usual = 1.4826 * float(np.median(np.abs(own - typical)))
+        usual = MEDIAN_TO_SIGMA * float(np.median(np.abs(own - typical)))
         below = (own < HARDLY * typical) & (own < typical - SURE * usual)
         odd.append(frames[below] if typical >= TYPICAL else frames[:0])
     return np.concatenate(odd)

@@ -12,6 +12,7 @@ from workflows.ingest.local_gain import DARK, DISPLAY, Surroundings, surrounding
 from workflows.ingest.trial.border_tone_mapping import Power, border_power
 from workflows.ingest.trial.trial_recovery import HUBER, Doubles, PixelSample
 from workflows.ingest.trial.unexplained import DETAIL, MIN_FLAT, SEEN, Rest
+from workflows.recovery.camera.noise import MEDIAN_TO_SIGMA
 
 WIDTHS = (1 / 40, 1 / 20, 1 / 10)
 """Widths of the surroundings that are tried, as shares of the frame's width,"""
@@ -133,7 +134,7 @@ def _fit(
         total = max(float((trust * a * a).sum()), 1e-12)
         power = float((trust * a * r).sum()) / total
         left = r - power * a
-        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-12)
+        scale = max(MEDIAN_TO_SIGMA * float(np.median(np.abs(left))), 1e-12)
         trust = np.minimum(1, HUBER * scale / np.maximum(np.abs(left), 1e-12))
     # Pixels beside each other, and those of a frame, are not independent.
     pulls = [np.bincount(cluster, trust * a * left) for cluster in clusters]

@@ -26,7 +26,7 @@ from workflows.ingest.measured_light import (
     unclipped_light,
 )
 from workflows.programs.program import Program
-from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.noise import MEDIAN_TO_SIGMA, NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.recover import Recovery, recover
@@ -375,7 +375,7 @@ def _fit(
             return None
         found = np.linalg.solve(gram, weighed.T @ r)
         size = np.abs(r - A @ found)
-        trust = np.minimum(1, HUBER * 1.4826 * np.median(size) / np.maximum(size, 1e-12))
+        trust = np.minimum(1, HUBER * MEDIAN_TO_SIGMA * np.median(size) / np.maximum(size, 1e-12))
     pull = (weighed * (r - A @ found)[:, np.newaxis]) @ np.linalg.inv(gram)
     sums = np.stack([np.bincount(square, p) for p in pull.T])
     count = np.count_nonzero(np.bincount(square))

@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 LEAST_READ = 2e-11
 """Variance of quantisation to 16 bits, in units of full scale squared: the least noise of a frame."""
+MEDIAN_TO_SIGMA = 1.4826
+"""Standard deviation of normal values in medians of their magnitudes: one over the normal quantile of 0.75. Outliers
+hardly change it (Hampel, "The influence curve and its role in robust estimation", J. Am. Stat. Assoc., 1974)."""
 
 _BINS = 12
 LEAST_SAMPLES = 10 * _BINS
