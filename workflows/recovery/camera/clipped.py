@@ -7,9 +7,9 @@ from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 
 NARROWEST = 0.1
-"""How much brighter than its clipped value a pixel may have been at least, as a share of rho."""
+"""Light that a pixel clipped at white may have seen beyond its clipped value, at least, as a share of rho."""
 DEVIATION = 2.0
-"""Standard deviation of such a value, in widths of what it may have been: exposures and white are not exact either."""
+"""Standard deviation of a clipped value, in widths of the range that it stands for, which is not known exactly."""
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
@@ -26,10 +26,12 @@ def bound_clipped(
 
     Parameters
     ----------
-    measurements, worth : (n, m, 3) float32
-        See `workflows.ingest.measured_light.PatternLight`.
+    measurements : (n, m, 3) float32
+        Linear camera values of n pixels under m patterns.
     usable : (n, m, 3) bool
         False where a value, or with crosstalk that of another channel, is clipped.
+    worth : (n, m, 3) float32
+        How many frames each value is worth, above 0.
     filmed : (m,) bool
         False where there is no frame of a pattern.
     photometry : Photometry
