@@ -3,7 +3,7 @@
 import { builtIn, fromFile } from "../app/composite/backdrops/backdrops.js";
 import { LiveGlass } from "../app/composite/live/live_glass.js";
 import { decodeLive } from "../app/composite/live/live_form.js";
-import { handleGestures, placement } from "../app/composite/placement.js";
+import { handleGestures, placementControls } from "../app/composite/placement.js";
 import { NAMES } from "../app/composite/backdrops/scenery.js";
 import { h } from "../app/lib/dom.js";
 import { preferred, speak, t } from "../app/lib/words.js";
@@ -15,8 +15,8 @@ speak(language, { de, en }[language]);
 const stage = document.getElementById("stage");
 const choices = document.getElementById("choices");
 const monitor = document.body.dataset.monitor.split(" ").map(Number);
-const placed = placement(() => glass.moved());
-const glass = new LiveGlass(stage.querySelector("canvas"), placed.values, new AbortController().signal);
+const controls = placementControls(() => glass.moved());
+const glass = new LiveGlass(stage.querySelector("canvas"), controls.values, new AbortController().signal);
 
 const say = (text) => (document.getElementById("status").textContent = text);
 
@@ -48,11 +48,11 @@ async function start() {
 	const found = await matte();
 	if (!glass.load(found, monitor)) return glass.gl && say(t("page.large"));
 	stage.style.setProperty("--aspect", found.width / found.height);
-	handleGestures(stage, placed, glass);
+	handleGestures(stage, controls, glass);
 	const choice = (name, i) =>
 		h("label", h("input", { type: "radio", name: "backdrop", checked: i === 0, onchange: () => use(builtIn(name, monitor)) }), t(`scene.${name}`));
 	choices.prepend(h("fieldset", h("legend", t("backdrop")), NAMES.map(choice)));
-	document.getElementById("reset").append(placed.reset);
+	document.getElementById("reset").append(controls.reset);
 	const own = document.querySelector("#own input");
 	own.onchange = () => {
 		take(own.files);

@@ -7,7 +7,7 @@ import { clipJob } from "./clip_job.js";
 import { comparison } from "./compare.js";
 import { downloads } from "./downloads.js";
 import { explanation } from "./explain.js";
-import { handleGestures, placement } from "./placement.js";
+import { handleGestures, placementControls } from "./placement.js";
 import { NAMES, scenery } from "./backdrops/scenery.js";
 import { Stage } from "./stage.js";
 import { cameraSymbol, choice, thumbOf, thumbs } from "./backdrops/thumb_choices.js";
@@ -18,11 +18,11 @@ import { recordButton } from "./recording.js";
 // The section, and its stage. `others` are mattes to compare with, by a name.
 export function compositing(matte, others, signal) {
 	const given = Object.fromEntries(new URLSearchParams(location.hash.split("?")[1]));
-	const placed = placement(() => stage.moved(), given);
-	const stage = new Stage(matte, placed.values, signal);
+	const controls = placementControls(() => stage.moved(), given);
+	const stage = new Stage(matte, controls.values, signal);
 	const explained = explanation(stage, matte, signal);
-	const video = clipJob(matte, () => ({ ...placed.values, around: stage.around ? "backdrop" : "nothing", fit: "frame" }), signal);
-	handleGestures(stage.element, placed, stage);
+	const video = clipJob(matte, () => ({ ...controls.values, around: stage.around ? "backdrop" : "nothing", fit: "frame" }), signal);
+	handleGestures(stage.element, controls, stage);
 
 	const play = h("button", {
 		type: "button", hidden: true,
@@ -57,7 +57,7 @@ export function compositing(matte, others, signal) {
 	stage.element.addEventListener("exact", () => {
 		// Another view may be in the URL already, whose event is still to come: it must not be replaced.
 		if (signal.aborted || location.hash.split("?")[0] !== view) return;
-		const state = new URLSearchParams(placed.moved);
+		const state = new URLSearchParams(controls.moved);
 		const { name } = stage.backdrop;
 		if (NAMES.includes(name) && name !== NAMES[0]) state.set("backdrop", name);
 		if (!stage.around) state.set("around", "nothing");
@@ -80,9 +80,9 @@ export function compositing(matte, others, signal) {
 	const keys = h("button", { type: "button", onclick: () => document.getElementById("keys").showModal() }, t("keys"));
 	const folded = (title, ...about) => h("details", h("summary", title), about);
 	const sheet = h("details.panel.sheet", { open: true }, h("summary", t("controls")),
-		h("div.row", full, play, recordButton(stage, matte, signal), explained.button, placed.reset, keys, h("label", transparent, " ", t("transparent")), unmasked),
+		h("div.row", full, play, recordButton(stage, matte, signal), explained.button, controls.reset, keys, h("label", transparent, " ", t("transparent")), unmasked),
 		stage.status, explained.panel, choices,
-		folded(t("placement"), h("p.hint", t("placement.how")), placed.sliders),
+		folded(t("placement"), h("p.hint", t("placement.how")), controls.sliders),
 		folded(t("compare"), comparison(stage, matte, others)), folded(t("take"), taken.element), video.element, stage.renderer);
 	const section = h("section.composite", { "aria-label": t("compositing") }, stage.element, leave, sheet);
 	section.addEventListener("fullscreenchange", () => filled(document.fullscreenElement));

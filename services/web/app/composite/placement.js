@@ -16,7 +16,7 @@ const KEYS = {
 };
 
 // The four numbers in `values`, at first those `given` as texts, and the elements that set them.
-export function placement(changed, given = {}) {
+export function placementControls(changed, given = {}) {
 	const values = { ...DEFAULTS };
 	const sliders = Object.fromEntries(CONTROLS.map(([name, , min, max, step]) => {
 		const logarithmic = name === "scale"; // as far from 1 to 10 as from 1 to a tenth
@@ -58,23 +58,23 @@ export function placement(changed, given = {}) {
 }
 
 // Lets keys, the wheel, the mouse and fingers set a placement behind a glass.
-export function handleGestures(element, placed, glass) {
+export function handleGestures(element, controls, glass) {
 	element.addEventListener("keydown", (event) => {
 		const [name, steps] = KEYS[event.key] ?? [];
 		if (!name || event.target !== element || event.ctrlKey || event.metaKey || event.altKey) return;
 		event.preventDefault();
-		placed.step(name, event.shiftKey && event.key.startsWith("Arrow") ? 5 * steps : steps);
+		controls.step(name, event.shiftKey && event.key.startsWith("Arrow") ? 5 * steps : steps);
 	});
 	element.addEventListener("wheel", (event) => {
 		if (document.activeElement !== element && !event.ctrlKey) return; // without focus the wheel scrolls the page
 		event.preventDefault();
-		placed.set({ scale: placed.values.scale * Math.exp(-event.deltaY * (event.deltaMode ? 0.03 : 0.001)) });
+		controls.set({ scale: controls.values.scale * Math.exp(-event.deltaY * (event.deltaMode ? 0.03 : 0.001)) });
 	}, { passive: false });
-	handlePointers(element, placed, glass);
+	handlePointers(element, controls, glass);
 }
 
 // One finger or the mouse moves; two fingers scale and turn as well.
-function handlePointers(element, placed, glass) {
+function handlePointers(element, controls, glass) {
 	const fingers = new Map();
 	const state = () => {
 		const [a, b = a] = [...fingers.values()];
@@ -92,13 +92,13 @@ function handlePointers(element, placed, glass) {
 		fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
 		const now = state();
 		const { width, height } = glass.spread;
-		const { right, down, scale, angle } = placed.values;
+		const { right, down, scale, angle } = controls.values;
 		const wanted = { right: right + (now.x - before.x) / width, down: down + (now.y - before.y) / height };
 		if (fingers.size === 2 && before.apart > 10) {
 			wanted.scale = (scale * now.apart) / before.apart;
 			wanted.angle = angle + now.angle - before.angle;
 		}
-		placed.set(wanted);
+		controls.set(wanted);
 	};
 	element.onpointerup = element.onpointercancel = (event) => fingers.delete(event.pointerId);
 }

@@ -3,7 +3,7 @@ import { button, fileField, h, problemBox } from "../lib/dom.js";
 import { fromFile } from "../composite/backdrops/backdrops.js";
 import { scenery } from "../composite/backdrops/scenery.js";
 import { cameraSymbol, choice, fileSymbol, thumbOf, thumbs } from "../composite/backdrops/thumb_choices.js";
-import { handleGestures, placement } from "../composite/placement.js";
+import { handleGestures, placementControls } from "../composite/placement.js";
 import { cameraBackdrop } from "../composite/backdrops/video_backdrops.js";
 import { fileInput, onDrop, upload } from "../upload/upload.js";
 import { GlassWindow } from "./glass_window.js";
@@ -18,9 +18,9 @@ export async function home(main, signal) {
 	if (areRemoved()) return location.replace("#/captures");
 	const samples = await fetchSamples(signal);
 	await new Promise((next) => requestAnimationFrame(() => setTimeout(next))); // the header shows while WebGL2 starts
-	const placed = placement(() => glass.moved());
-	const glass = new GlassWindow(placed.values, signal);
-	handleGestures(glass.element, placed, glass);
+	const controls = placementControls(() => glass.moved());
+	const glass = new GlassWindow(controls.values, signal);
+	handleGestures(glass.element, controls, glass);
 	const problem = h("div");
 	const fail = (error) => signal.aborted || problem.replaceChildren(problemBox(error));
 	const title = h("h1");
@@ -81,11 +81,11 @@ export async function home(main, signal) {
 	glass.fit(sheet.offsetTop);
 	use(drawn(SCENES[0]), backdrops[0].querySelector("input"));
 	await show(samples[0]);
-	greet(glass.element, placed, signal);
+	greet(glass.element, controls, signal);
 }
 
 // Sways the backdrop until something is touched.
-function greet(element, placed, signal) {
+function greet(element, controls, signal) {
 	if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
 	const touched = new AbortController();
 	for (const type of ["pointerdown", "keydown", "wheel"]) addEventListener(type, () => touched.abort(), { signal: touched.signal, passive: true });
@@ -93,7 +93,7 @@ function greet(element, placed, signal) {
 	(function sway() {
 		const part = Math.min(1, (performance.now() - start) / GREETING);
 		if (touched.signal.aborted || signal.aborted) return;
-		placed.set({ right: SWAY * Math.sin(2 * Math.PI * part) * (1 - part) });
+		controls.set({ right: SWAY * Math.sin(2 * Math.PI * part) * (1 - part) });
 		if (part < 1) requestAnimationFrame(sway);
 		else touched.abort();
 	})();
