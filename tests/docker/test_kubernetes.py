@@ -155,7 +155,7 @@ def test_worker_reaches_its_own_memory_limit_before_that_of_its_container(tmp_pa
         text.partition(":-")[2].removesuffix("}")
         for text in (worker["environment"]["ENVMATTE_WORKER_MEMORY"], worker["mem_limit"])
     )
-    decoder = room(Settings(data=tmp_path).limits.image)
+    decoder = room(Settings(data=tmp_path).limits.image_bytes)
     for limit, memory in (
         (of_pod, environment("envmatte-worker")["ENVMATTE_WORKER_MEMORY"]),
         (whole.removesuffix("g"), own),

@@ -47,13 +47,13 @@ def damaged_film(random: Random, data: bytes) -> bytes:
 
 def read_clip(data: bytes, folder: Path) -> None:
     file = io.BytesIO(data)
-    with Decoder(LIMITS.image) as found:
+    with Decoder(LIMITS.image_bytes) as found:
         _, ticks, _ = films.times(found, file, "a.mp4", 2000)
         film, signatures, again, large = films.scan(found, file, "a.mp4", 1 << 20, 0.1)
         assert len(signatures) == len(again) >= len(large.frames)
         plan = [[Share(tick, TOTAL_WEIGHT)] for tick in ticks[:5].tolist()]
         for picture in films.means(found, file, "a.mp4", plan, film.width, film.height):
-            assert picture.nbytes <= LIMITS.image
+            assert picture.nbytes <= LIMITS.image_bytes
 
 
 @cache

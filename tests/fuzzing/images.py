@@ -21,37 +21,37 @@ BOXES = b"|".join(
 
 def read_image(data: bytes, folder: Path) -> None:
     integer_formats.orientation(data)
-    pixels = integer_formats.decode(data, memory=LIMITS.image)
+    pixels = integer_formats.decode(data, memory=LIMITS.image_bytes)
     assert pixels.dtype in (np.uint8, np.uint16)
     assert pixels.ndim == 3
     assert pixels.shape[2] in (1, 3)
-    assert 0 < pixels.nbytes <= LIMITS.image
+    assert 0 < pixels.nbytes <= LIMITS.image_bytes
 
 
 def read_any_backdrop(data: bytes, folder: Path) -> None:
-    backdrop = backdrop_of(decode.decode(data, "srgb", memory=LIMITS.image), "srgb")
+    backdrop = backdrop_of(decode.decode(data, "srgb", memory=LIMITS.image_bytes), "srgb")
     pixels = backdrop.pixels
     assert pixels.ndim == 3
-    assert 0 < pixels.nbytes <= 4 * LIMITS.image
+    assert 0 < pixels.nbytes <= 4 * LIMITS.image_bytes
     assert np.isfinite(pixels).all()
 
 
 def read_floats(data: bytes, folder: Path) -> None:
     if not float_formats.is_float(data):
         raise Refused
-    light = float_formats.decode(data, memory=LIMITS.image)
+    light = float_formats.decode(data, memory=LIMITS.image_bytes)
     assert light.dtype == np.float32
     assert light.ndim == 3
     assert light.shape[2] in (1, 3)
-    assert 0 < light.nbytes <= LIMITS.image
+    assert 0 < light.nbytes <= LIMITS.image_bytes
 
 
 def read_raw(data: bytes, folder: Path) -> None:
-    light = camera_raw.decode(data, memory=LIMITS.image)
+    light = camera_raw.decode(data, memory=LIMITS.image_bytes)
     assert light.dtype == np.float32
     assert light.ndim == 3
     assert light.shape[2] == 3
-    assert light.nbytes <= LIMITS.image
+    assert light.nbytes <= LIMITS.image_bytes
 
 
 def make_raw(random: Random, valid: Files) -> bytes:

@@ -65,7 +65,7 @@ class CaptureArchive:
         info = self._entries.get(entry)
         if info is None:
             raise CaptureError(f"{entry} is not in the archive", entry=entry)
-        return zip_files.read(self._archive, info, self._limits.image, CaptureError)
+        return zip_files.read(self._archive, info, self._limits.image_bytes, CaptureError)
 
     @contextmanager
     def open(self, entry: str) -> Iterator[BinaryIO]:

@@ -80,7 +80,7 @@ def scan(
     """
     with blaming(entry, decoder):
         answers = decoder.run(
-            _scan, file, entry=entry, memory=decoder.image, max_bytes=max_bytes, every=every
+            _scan, file, entry=entry, memory=decoder.image_bytes, max_bytes=max_bytes, every=every
         )
         with decoder.checking():
             found, signatures, ticks, grey, frames = answers
@@ -112,7 +112,7 @@ def times(
         If it can't be read, or has more than ``max_frames``.
     """
     with blaming(entry, decoder):
-        answers = decoder.run(_times, file, entry=entry, memory=decoder.image, max_frames=max_frames)
+        answers = decoder.run(_times, file, entry=entry, memory=decoder.image_bytes, max_frames=max_frames)
         with decoder.checking():
             found, ticks, last = answers
             _require_ascending(ticks)
@@ -163,7 +163,7 @@ def means(
         If a frame can't be decoded again.
     """
     with blaming(entry, decoder):
-        answers = decoder.run(_means, file, entry=entry, memory=decoder.image, plan=plan, full=full)
+        answers = decoder.run(_means, file, entry=entry, memory=decoder.image_bytes, plan=plan, full=full)
         for _ in plan:
             with decoder.checking():
                 mean = next(answers, None)

@@ -50,7 +50,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     CaptureError
     """
     limits = task.limits
-    with uploads.read(objects, task.capture) as file, Decoder(limits.image) as decoder:
+    with uploads.read(objects, task.capture) as file, Decoder(limits.image_bytes) as decoder:
         archive = CaptureArchive(file, limits)
         manifest = archive.manifest
         patterns = _decode_patterns(decoder, archive, limits)
@@ -240,7 +240,7 @@ def work(objects: Objects, task: Task, tile: int) -> int:
     stack, slab = Stack(objects, task.capture), task.plan["slab"]
     first, last = tile * slab, min((tile + 1) * slab, stack.frames)
     frames = np.empty((last - first, stack.height, stack.width, stack.channels), stack.dtype)
-    with uploads.read(objects, task.capture) as file, Decoder(task.limits.image) as decoder:
+    with uploads.read(objects, task.capture) as file, Decoder(task.limits.image_bytes) as decoder:
         archive = CaptureArchive(file, task.limits)
         for n, pixels in enumerate(_pixels(decoder, archive, stack, first, last)):
             frames[n] = pixels

@@ -125,7 +125,7 @@ def read(
     """
     data = archive.read(entry)
     with blaming(entry, decoder):
-        return decoder.picture(_decode, data, entry=entry, memory=decoder.image, turn=turn, full=full)
+        return decoder.picture(_decode, data, entry=entry, memory=decoder.image_bytes, turn=turn, full=full)
 
 
 def read_integers(decoder: Decoder, archive: CaptureArchive, entry: str) -> Codes:
@@ -138,7 +138,7 @@ def read_integers(decoder: Decoder, archive: CaptureArchive, entry: str) -> Code
     """
     data = archive.read(entry)
     with blaming(entry, decoder):
-        return decoder.picture(_decode_integers, data, entry=entry, memory=decoder.image)
+        return decoder.picture(_decode_integers, data, entry=entry, memory=decoder.image_bytes)
 
 
 def storage_of(

@@ -106,15 +106,15 @@ class Decoder:
 
     Parameters
     ----------
-    image : int
+    image_bytes : int
         Bytes that one decoded picture may take. The process may allocate `room` for it.
     seconds : float
         Time for each answer. While a file is read piece by piece, time between two signs of life.
     """
 
-    def __init__(self, image: int, seconds: float = SECONDS) -> None:
-        self.image, self._seconds = image, seconds
-        self._socket, self._wanted = server.fork(room(image))
+    def __init__(self, image_bytes: int, seconds: float = SECONDS) -> None:
+        self.image_bytes, self._seconds = image_bytes, seconds
+        self._socket, self._wanted = server.fork(room(image_bytes))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         self._how: str | None = None
 
@@ -233,7 +233,7 @@ class Decoder:
                 raise ValueError("it sent no picture")
             if pixels.shape[2] not in ((1, 3) if pixels.dtype == np.float32 else (1, 2, 3, 4)):
                 raise ValueError(f"a picture can't have {pixels.shape[2]} channels of {pixels.dtype}")
-            if pixels.dtype == np.int64 or pixels.nbytes > self.image:
+            if pixels.dtype == np.int64 or pixels.nbytes > self.image_bytes:
                 raise ValueError(f"{pixels.nbytes} bytes of {pixels.dtype} are not allowed")
         return pixels
 
@@ -273,8 +273,10 @@ class Decoder:
         size = dtype.itemsize
         for side in head.shape:
             size *= side
-        if size > max(self.image, LEAST_BYTES):
-            raise ValueError(f"{head.shape} values of {dtype} take more than the limit of {self.image} bytes")
+        if size > max(self.image_bytes, LEAST_BYTES):
+            raise ValueError(
+                f"{head.shape} values of {dtype} take more than the limit of {self.image_bytes} bytes"
+            )
         values = np.empty(head.shape, dtype)
         self._fill(values.reshape(-1).view(np.uint8).data, deadline)
         return values
@@ -297,9 +299,9 @@ class Decoder:
         self._socket.sendall(data)
 
 
-def room(image: int) -> int:
-    """Bytes that a decoder may take if one decoded picture may take ``image`` bytes."""
-    return COPIES * image + EXTRA
+def room(image_bytes: int) -> int:
+    """Bytes that a decoder may take if one decoded picture may take ``image_bytes``."""
+    return COPIES * image_bytes + EXTRA
 
 
 @contextmanager
@@ -322,11 +324,12 @@ def blaming(entry: str, decoder: Decoder) -> Iterator[None]:
     try:
         yield
     except MemoryError as error:
+        limit = room(decoder.image_bytes)
         raise CaptureError(
-            f"decoding {entry} takes more than the {room(decoder.image) >> 20} MB of memory allowed for it: it is "
-            "damaged, or too large. Copy it again from the camera, or make it smaller",
+            f"decoding {entry} takes more than the {limit >> 20} MB of memory allowed for it: it is damaged, or too "
+            "large. Copy it again from the camera, or make it smaller",
             entry=entry,
-            limit=room(decoder.image),
+            limit=limit,
         ) from error
     except ImageError as error:
         raise CaptureError(error.detail, entry=entry, **error.fields) from error

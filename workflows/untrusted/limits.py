@@ -29,7 +29,7 @@ class Limits:
     pixels: int | None = None
 
     @property
-    def image(self) -> int:
+    def image_bytes(self) -> int:
         """Bytes that one entry, or one decoded image, may take."""
         return self.memory // 4
 

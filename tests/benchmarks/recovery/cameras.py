@@ -54,12 +54,12 @@ def read(file: Path) -> list[str]:
 
 
 def frame(name: str, data: bytes) -> str:
-    with Decoder(LIMITS.image) as decoder:
+    with Decoder(LIMITS.image_bytes) as decoder:
         return _shape(stills.read(decoder, _archive(name, data), name))
 
 
 def film(name: str, data: bytes) -> str:
-    with Decoder(LIMITS.image) as decoder:
+    with Decoder(LIMITS.image_bytes) as decoder:
         found, ticks, _ = films.times(decoder, io.BytesIO(data), name, FRAMES)
     gaps = np.diff(ticks) * float(found.time_base)
     rate = "" if not gaps.size else f", {1 / gaps.max():.1f} to {1 / gaps.min():.1f} a second"
@@ -70,7 +70,7 @@ def film(name: str, data: bytes) -> str:
 
 
 def backdrop(name: str, data: bytes) -> str:
-    decoders = Decoders(LIMITS.image)
+    decoders = Decoders(LIMITS.image_bytes)
     try:
         return _shape(decoders.decode(data, "srgb"))
     finally:

@@ -189,7 +189,7 @@ def _reading(objects: Objects, task: Task) -> Iterator[tuple[Decoder, BinaryIO]]
     except FileNotFoundError as error:
         raise Corrupt("the clip is no longer in the store; send it again") from error
     try:
-        with file, Decoder(task.limits.image) as decoder:
+        with file, Decoder(task.limits.image_bytes) as decoder:
             yield decoder, file
     except CaptureError as error:
         fields = {name: value for name, value in error.fields.items() if name != "entry"}

@@ -194,7 +194,7 @@ class Reader:
         frame = f"{given.width} x {given.height} pixels"
         grid = f"{given.columns} x {given.rows} cells"
         for what, cost, limit in (
-            (f"a frame of {frame}", 3 * pixels, limits.image),
+            (f"a frame of {frame}", 3 * pixels, limits.image_bytes),
             (f"a matte of {frame}", PIXEL_BYTES * pixels, limits.unpacked),
             (f"a grid of {grid}", LIGHT_BYTES * given.columns * given.rows, limits.memory),
         ):
