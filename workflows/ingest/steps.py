@@ -28,7 +28,7 @@ from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.frame_means import Share
 from workflows.ingest.video.matching import MAX_MATCHED, match_frames
-from workflows.ingest.video.resemblance import lay_out
+from workflows.ingest.video.resemblance import coarse_light
 from workflows.jobs import Steps, Task
 from workflows.programs.parts import Images
 from workflows.untrusted.decoder import Decoder
@@ -173,7 +173,7 @@ def _examine_film(
             limit=MAX_MATCHED,
         )
     curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
-    light = lay_out(program, curve, patterns)
+    light = coarse_light(program, curve, patterns)
     every = None if video.border is None else 1 / (LOOKS * video.patterns_per_second)
     with archive.open(entry) as file:
         film, signatures, ticks, large = films.scan(decoder, file, entry, limits.memory // 4, every)

@@ -11,7 +11,7 @@ from storage.layout.captures import Stack, thumbnail_mask
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.measured_light import exposures_of
-from workflows.ingest.video.resemblance import GRIDS, MIN_PATTERNS, lay_out
+from workflows.ingest.video.resemblance import GRIDS, MIN_PATTERNS, coarse_light
 from workflows.programs.parts import Bernoulli
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import MEDIAN_TO_SIGMA
@@ -117,7 +117,7 @@ def check_frames(stack: Stack) -> None:
     parts = _random_parts(patterns, program)
     if not parts:
         return
-    cells = _cells(lay_out(program, _curve(program.monitor.response), stack.images()))
+    cells = _cells(coarse_light(program, _curve(program.monitor.response), stack.images()))
     found = find_order(seen, patterns, cells, parts)
     if found is not None:
         stack.annotate(order=found._replace(first=int(frames[found.first]))._asdict())

@@ -92,7 +92,7 @@ def match_frames(
         Length of a tick in seconds.
     program : Program
     light : (patterns, rows, columns, 3) float32
-        Of its patterns, see `resemblance.lay_out`.
+        Of its patterns, see `resemblance.coarse_light`.
     large : LargeFrames
         Used with a border only.
     video : Video

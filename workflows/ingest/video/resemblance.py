@@ -23,8 +23,8 @@ _ODD = 5.0  # times the median squared distance from the part's mean: an odd pat
 _APART = 0.1  # difference of light from which one constant pattern must look brighter than the other
 
 
-def lay_out(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]] = ()) -> Light:
-    """Lay the light of every pattern of a program out on the finest of `GRIDS`."""
+def coarse_light(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]] = ()) -> Light:
+    """The light of every pattern of a program on the finest of `GRIDS`."""
     columns, rows = GRIDS[-1]
     laid = np.empty((program.count, rows, columns, 3), np.float32)
     for start, part in zip(program.starts, program.parts, strict=False):
@@ -47,7 +47,7 @@ def score(program: Program, light: Light, looks: Mapping[int, Doubles]) -> float
     ----------
     program : Program
     light : Light
-        Of all its patterns, see `lay_out`.
+        Of all its patterns, see `coarse_light`.
     looks : mapping of int to (rows, columns, 3) float64
         What the camera saw of patterns, in approximately linear light.
 
