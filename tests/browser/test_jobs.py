@@ -194,6 +194,7 @@ def test_recovery_follows_the_ingest_after_an_outage(
     expect(desk.get_by_role("alert")).to_contain_text("The service does not answer", timeout=MINUTE)
     desk.unroute(f"**/v1/{lost}")
     expect(desk).to_have_url(re.compile("#/mattes/"), timeout=2 * MINUTE)
+    service.client.wait(service.client.matte(desk.url.rpartition("/")[2])["job"])
 
 
 def test_activity_lists_the_last_jobs(desk: Page, service: Service, ready: tuple[str, str]) -> None:
