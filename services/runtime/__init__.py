@@ -15,7 +15,7 @@ storage.objects.zarr_store.array_metadata          1 each the zarr metadata of a
 workflows.composite.quantise._edges                1 each the codes of a transfer and a dtype: 0.4 MB or less
 workflows.composite.strips._empty_strip            8      strips in which nothing is recovered, of a size each: 0.7 MB
 workflows.images.hdr._codes                        1      the codes of sRGB for light: 0.1 MB
-workflows.images.hdr._light                        2      the light of codes for HDR displays: 0.3 MB each
+workflows.images.hdr.light_of_hdr                  2      the light of codes for HDR displays: 0.3 MB each
 workflows.mattes.imports.reader._document_of_group 1      the zarr.json of a group
 workflows.mattes.imports.reader._document_of_one   1 each the zarr.json of an array of a dtype
 workflows.mattes.options._schemas                  2      the JSON schemas of a method's options
