@@ -314,3 +314,17 @@ def test_pictures_of_a_capture_are_fetched_again_after_an_outage(
     for picture in pictures.all():
         expect(picture).to_be_visible()
     expect(desk.get_by_role("alert")).to_have_count(0)
+
+
+def test_question_ends_with_the_view_that_asks_it(
+    desk: Page, service: Service, ready: tuple[str, str]
+) -> None:
+    desk.goto(f"{service.url}/#/captures")
+    desk.goto(f"{service.url}/#/captures/{ready[0]}")
+    desk.get_by_role("button", name="Delete", exact=True).click()
+    question = desk.get_by_role("dialog", name="Delete this capture?")
+    expect(question).to_be_visible()
+    desk.go_back()
+    expect(desk).to_have_title("Captures · envmatte")
+    expect(question).to_be_hidden()
+    assert service.client.capture(ready[0])["state"] == "ready"

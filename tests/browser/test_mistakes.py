@@ -182,20 +182,6 @@ def test_reload_and_back_button_keep_the_view(desk: Page, service: Service, read
 
 
 @pytest.mark.exhaustive
-def test_question_ends_with_the_view_that_asks_it(
-    desk: Page, service: Service, ready: tuple[str, str]
-) -> None:
-    desk.goto(f"{service.url}/#/captures")
-    desk.goto(f"{service.url}/#/captures/{ready[0]}")
-    desk.get_by_role("button", name="Delete", exact=True).click()
-    question = desk.get_by_role("dialog", name="Delete this capture?")
-    expect(question).to_be_visible()
-    desk.go_back()
-    expect(desk).to_have_title("Captures · envmatte")
-    expect(question).to_be_hidden()
-    assert service.client.capture(ready[0])["state"] == "ready"
-
-
 def test_deleting_what_another_tab_deleted_succeeds(desk: Page, service: Service, ball: Path) -> None:
     capture = service.client.upload(ball)
     service.client.wait(capture["job"])
