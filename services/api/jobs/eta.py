@@ -8,7 +8,6 @@ from sqlalchemy import Connection, Row, select
 from services.api.jobs.situation import Situation
 from storage.database.tables import jobs
 from storage.layout.blocks import block_edge
-from storage.records import leases
 
 TYPICAL = 1.4e-7
 """Seconds per unit of `_report_work` on a 2.5 GHz core."""
@@ -33,10 +32,8 @@ def seconds_left(row: Row[Any], now: float, situation: Situation) -> float | Non
     if row.paced_at is None or row.done <= row.paced_done or row.moved_at <= row.paced_at:
         return None  # the last: the clock has gone back
     pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)
-    heartbeat = situation.heartbeat
-    workers = len(heartbeat.cluster["workers"]) if heartbeat else 0
     # No more has been done meanwhile than each worker's tile: workers may have stopped, or the clock gone forward.
-    since = min(now - row.moved_at, pace * max(workers, 1))
+    since = min(now - row.moved_at, pace * max(situation.workers, 1))
     left = float((row.total - row.done) * pace - since)
     return left + finishing if left > 0 else None
 
@@ -44,8 +41,7 @@ def seconds_left(row: Row[Any], now: float, situation: Situation) -> float | Non
 def seconds_to_recover(connection: Connection, capture: Row[Any]) -> dict[str, float] | None:
     """Seconds that a recovery of a capture will take by quality, by the trial of its ingest and the workers of now."""
     plan = connection.scalar(select(jobs.c.plan).where(jobs.c.id == capture.job)) or {}
-    heartbeat = leases.last_heartbeat(connection)
-    workers = len(heartbeat.cluster["workers"]) if heartbeat else 0
+    workers = Situation(connection).workers
     if not plan.get("core_seconds") or not workers:
         return None
     edge = block_edge(plan["height"], plan["width"])

@@ -97,7 +97,7 @@ class Job(BaseModel):
 
     @classmethod
     def _of(cls, row: Row[Any], name: str, situation: Situation) -> "Job":
-        now, heartbeat = time.time(), situation.heartbeat
+        now = time.time()
         # Not below zero: the clock may go back.
         ran = max((row.finished_at or now) - row.started_at, 0.0) if row.started_at else 0.0
         queued_at = row.queued_at or row.created_at
@@ -118,7 +118,7 @@ class Job(BaseModel):
             waits_for=reason(row, situation),
             queued_seconds=max((row.started_at or row.finished_at or now) - queued_at, 0.0),
             run_seconds=ran,
-            workers=len(heartbeat.cluster["workers"]) if running and heartbeat else 0,
+            workers=situation.workers if running else 0,
             options=row.options,
             problem=row.problem,
             video=f"/v1/jobs/{row.id}/video.mp4"

@@ -28,6 +28,11 @@ class Situation:
         """The coordinator's last heartbeat."""
         return leases.last_heartbeat(self._connection)
 
+    @property
+    def workers(self) -> int:
+        """The number of workers, as the coordinator last saw it; 0 if there has been none."""
+        return len(self.heartbeat.cluster["workers"]) if self.heartbeat else 0
+
     @cached_property
     def running(self) -> int:
         """The number of running jobs of all owners."""

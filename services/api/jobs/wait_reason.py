@@ -50,6 +50,5 @@ def reason(row: Row[Any], situation: Situation) -> str | None:
     if still > NO_PROGRESS:
         return f"no progress in the last {still:.0f} s: a tile takes long, or its worker does not answer"
     if others := situation.running - 1:
-        workers = len(heartbeat.cluster["workers"]) if heartbeat else 0
-        return f"it shares the workers, {workers} in all, with other jobs: {others}"
+        return f"it shares the workers, {situation.workers} in all, with other jobs: {others}"
     return None
