@@ -276,6 +276,20 @@ def test_another_upload_does_not_end_a_recording(desk: Page, service: Service, b
     expect(desk.get_by_role("button", name="Stop recording")).to_be_visible()
 
 
+def test_former_playback_does_not_end_a_recording(desk: Page, service: Service) -> None:
+    made = service.http.post(
+        "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}
+    ).json()
+    shown(service, made["id"], "shown")
+    held: list[Route] = []
+    desk.route("**/v1/programs/*/events", lambda route: held.append(route))
+    filming(desk, service)
+    with desk.expect_response("**/v1/programs/*/events"):
+        held.pop().continue_()
+    desk.wait_for_timeout(1500)  # longer than recording continues after a program
+    expect(desk.get_by_role("button", name="Stop recording")).to_be_visible()
+
+
 def test_outage_is_said_while_a_program_is_followed(desk: Page, service: Service) -> None:
     made = service.http.post("/v1/programs", json={"program": SHORT, "monitor": SCREEN}).json()
     desk.route("**/v1/programs/*/events", lambda route: route.abort("connectionreset"))

@@ -117,8 +117,10 @@ export async function program(main, signal, id) {
 		bar.value = now.shown;
 	};
 	const changed = (now) => {
+		const isNews = now.showing?.told_at !== found.showing?.told_at; // else a playback that may have ended long ago
 		[found, since] = [now, performance.now()];
 		draw();
+		if (!isNews) return;
 		const { phase: reported } = found.showing ?? {};
 		if (reported === "countdown" && age() < SILENT) recorder?.start();
 		if (reported === "shown" || reported === "stopped") recorder?.stop(reported === "shown");
