@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self, overload
 
 from services.client import _download
 from services.client._errors import FileChanged, NotFound, foreign
-from services.client._paths import id_of, path_of
+from services.client._paths import id_of, path_of, state_of
 from services.client._records import Capture, Job, JobFailed, Layers, Matte, Record
 
 if TYPE_CHECKING:
@@ -291,7 +291,7 @@ class Client:
             ``transfer``, ``around``, ``fit``, ``right``, ``down``, ``scale`` and ``angle``, as the call takes them.
         """
         wanted |= {"webhook": webhook} if webhook else {}
-        size = clip.stat().st_size
+        size = state_of(clip).st_size
         headers = {"Content-Type": "video/*", "Content-Length": str(size)} | _key()
         path = f"{path_of(Matte, matte)}/composite"
         return Job.of(
@@ -355,7 +355,7 @@ class Client:
         progress : callable, optional
             Is called with the bytes sent, and with all there are. The service checks them after the last.
         """
-        size = file.stat().st_size
+        size = state_of(file).st_size
         headers = {"Content-Type": "application/zip", "Content-Length": str(size)} | _key()
 
         def body() -> Iterator[bytes]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from services.client._errors import Busy, FileChanged, NotFound, ServiceError, Unreachable
+from services.client._paths import state_of
 
 if TYPE_CHECKING:
     import httpx2
@@ -41,7 +42,7 @@ def send(
     from services.client import _session
     from services.client._declared import declared
 
-    state = file.stat()
+    state = state_of(file)
     size = state.st_size
     mark = f"{file.resolve()} {size} {state.st_mtime_ns}"
     key = hashlib.sha256(mark.encode(errors="surrogateescape")).hexdigest()

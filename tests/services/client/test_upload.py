@@ -1,5 +1,7 @@
 """An upload over a bad line: to a web server that takes no large request."""
 
+import os
+from functools import partial
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import SimpleNamespace
@@ -59,6 +61,15 @@ def test_requests_get_smaller_until_they_come_through_and_larger_again(
     fails, comes = 2 * MOST, MOST
     assert sizes == [2 * fails, fails, *3 * [comes, fails], comes, comes]
     assert waits[1] > waits[0] == waits[2]
+
+
+def test_only_files_are_sent(tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "ball.zip")
+    with Client("http://127.0.0.1:9") as client:
+        for send in (client.upload, client.import_matte, partial(client.composite_clip, "matte")):
+            for path in (pipe, tmp_path):
+                with pytest.raises(ValueError, match="is not a file: write what it holds into one"):
+                    send(path)
 
 
 @pytest.mark.parametrize("status", [200, 502])
