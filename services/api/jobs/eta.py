@@ -16,7 +16,7 @@ STEPS = 1.0
 
 
 def seconds_left(row: Row[Any], now: float, situation: Situation) -> float | None:
-    """Seconds until a running job has succeeded; None until the pace of its tiles is known, or if the last are late.
+    """Seconds until a running job has succeeded; None until the pace of its tiles is known, or if it is late.
 
     Parameters
     ----------
@@ -27,8 +27,8 @@ def seconds_left(row: Row[Any], now: float, situation: Situation) -> float | Non
         return None
     finishing = _finishing(row, situation) if row.kind == "ingest" else 0.0
     if row.done == row.total:
-        elapsed = now - row.stage_at if row.stage == "finishing" else 0.0
-        return max(finishing - elapsed, 0.0)
+        left = finishing - (now - row.stage_at if row.stage == "finishing" else 0.0)
+        return left if left > 0 else None
     if row.paced_at is None or row.done <= row.paced_done or row.moved_at <= row.paced_at:
         return None  # the last: the clock has gone back
     pace = (row.moved_at - row.paced_at) / (row.done - row.paced_done)

@@ -48,6 +48,8 @@ def reason(row: Row[Any], situation: Situation) -> str | None:
         return "the coordinator starts it soon"
     still = time.time() - row.moved_at
     if still > NO_PROGRESS:
+        if row.total and row.done == row.total:
+            return f"no progress in the last {still:.0f} s: its last step takes long, or its worker does not answer"
         return f"no progress in the last {still:.0f} s: a tile takes long, or its worker does not answer"
     if others := situation.running - 1:
         return f"it shares the workers, {situation.workers} in all, with other jobs: {others}"

@@ -46,7 +46,7 @@ def test_recovery_continues_at_its_pace(engine: Engine) -> None:
         job = running(c, "recover", 2)
         assert left(c, job, 2.0) == pytest.approx(8)
         assert left(c, job, 2.5) == pytest.approx(7.5)
-        assert left(c, running(c, "recover", 10), 10.0) == 0
+        assert left(c, running(c, "recover", 10), 10.0) is None
         assert left(c, running(c, "recover", 2, paced_at=None), 2.0) is None
 
 
@@ -66,7 +66,7 @@ def test_ingest_has_a_step_after_its_tiles(engine: Engine) -> None:
         assert left(c, running(c, "ingest", 2), 2.0) == pytest.approx(8 + FINISHING)
         job = running(c, "ingest", 10, stage="finishing", stage_at=10.0)
         assert left(c, job, 10.1) == pytest.approx(FINISHING - 0.1)
-        assert left(c, job, 1000.0) == 0
+        assert left(c, job, 1000.0) is None
         assert left(c, running(c, "ingest", 10), 11.0) == pytest.approx(FINISHING)
 
 

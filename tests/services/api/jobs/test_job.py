@@ -74,6 +74,23 @@ def test_page_of_jobs_takes_as_many_queries_as_a_job_of_each_kind(engine: Engine
     assert (len(found), many) == (18, few)
 
 
+def test_job_without_progress_says_what_takes_long(engine: Engine) -> None:
+    with writing(engine) as c:
+        token = leases.acquire(c, "here")
+        assert token is not None
+        leases.renew(c, token, {"workers": ["a"], "problem": None})
+        job = jobs.add(c, "ingest", "c", {})
+        jobs.enter_stage(c, job, "preparing")
+        tiles.add_plan(c, job, {"tiles": 2, "frames": 1, "width": 8, "height": 8})
+        for done, what in ((0, "a tile"), (2, "its last step")):
+            tiles.mark_done(c, job, [(tile, 1.0, 1) for tile in range(done)])
+            jobs.change(c, job, moved_at=time.time() - 40)
+            waits_for = Job.read(c, job).waits_for
+            assert (
+                waits_for == f"no progress in the last 40 s: {what} takes long, or its worker does not answer"
+            )
+
+
 def test_a_job_that_a_newer_service_queued_is_shown(tmp_path: Path, engine: Engine, objects: Objects) -> None:
     with writing(engine) as c:
         job = jobs.add(c, "newer", "c", {})

@@ -179,6 +179,7 @@ export const de = {
 	"no frame of the video can be decoded: it is cut off or damaged, or has an index that takes too much memory. Copy it again from the camera": "kein Bild des Videos ist lesbar: Es ist abgeschnitten oder beschädigt, oder sein Index braucht zu viel Speicher. Neu von der Kamera kopieren",
 	"no frames that stand still show its number in the border": "kein ruhiges Bild zeigt seine Nummer im Rand",
 	"no progress in the last {seconds} s: a tile takes long, or its worker does not answer": "seit {seconds} s kein Fortschritt: Eine Kachel dauert lange, oder ihr Worker antwortet nicht",
+	"no progress in the last {seconds} s: its last step takes long, or its worker does not answer": "seit {seconds} s kein Fortschritt: Der letzte Schritt dauert lange, oder sein Worker antwortet nicht",
 	"no two frames of it are alike: it was too short, or something moved": "keine zwei Bilder davon gleichen sich: Es war zu kurz, oder etwas hat sich bewegt",
 	"no two frames show it whole": "keine zwei Bilder zeigen es ganz",
 	"no worker is connected to the scheduler; start some with `envmatte worker`": "kein Worker ist mit dem Scheduler verbunden; welche mit `envmatte worker` starten",
