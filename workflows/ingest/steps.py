@@ -27,7 +27,7 @@ from workflows.ingest.trial.steadiness import find_steadiness
 from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.frame_means import Share
-from workflows.ingest.video.matching import MAX_MATCHED, match_frames
+from workflows.ingest.video.matching import MAX_MATCHED, Expected, match_frames
 from workflows.ingest.video.resemblance import coarse_light
 from workflows.jobs import Steps, Task
 from workflows.programs.parts import Images
@@ -178,9 +178,8 @@ def _examine_film(
     with archive.open(entry) as file:
         film, signatures, ticks, large = films.scan(decoder, file, entry, limits.memory // 4, every)
     tick = float(film.time_base)
-    filmed = match_frames(
-        signatures, ticks, tick, program, light, large, video, unfinished=manifest.unfinished
-    )
+    expected = Expected(program, light, video, manifest.unfinished)
+    filmed = match_frames(signatures, ticks, tick, large, expected)
     frames = len(filmed.shares)
     attributes = {"patterns": list(filmed.shares), "exposures": [1.0] * frames, "video": filmed.record}
     numbers, sent = program.constants

@@ -1,6 +1,6 @@
 """Match the frames of a video to the patterns that they show, and decide whether enough of them were found."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,8 +21,6 @@ from workflows.ingest.video.timing import FoundPatterns, find_by_timing
 from workflows.programs.program import Program
 
 Doubles = NDArray[np.float64]
-Refusal = Callable[[str], CaptureError]
-"""Makes the error to raise from what is wrong."""
 
 MAX_MATCHED = 2000
 """Patterns of a program that is filmed: matching takes memory in proportion to their square."""
@@ -42,6 +40,41 @@ _AS_LIKELY = 10.0  # difference of negative log likelihoods up to which timings 
 _EVENTS = 2  # for each pattern, at most
 _RESTLESS = 5.0  # codes of noise: nothing stands still
 _GAMMA = 2.2  # close enough to any camera's curve to compare what it saw
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a video should show.
+
+    Attributes
+    ----------
+    program : Program
+    light : (patterns, rows, columns, 3) float32
+        Of its patterns, see `resemblance.coarse_light`.
+    video : Video
+        If it has a border, the patterns were shown in it, between a lead-in and a lead-out; see
+        `workflows.programs.border.schedule`.
+    unfinished : bool
+        Whether the program need not have been shown to its end: what was not is not missing.
+    """
+
+    program: Program
+    light: resemblance.Light
+    video: Video
+    unfinished: bool
+
+    @property
+    def rate(self) -> float:
+        """About how many patterns were shown in a second."""
+        return self.video.patterns_per_second
+
+    @property
+    def has_border(self) -> bool:
+        return self.video.border is not None
+
+    def refusal(self, reason: str) -> CaptureError:
+        """The error to raise if the video shows something else."""
+        return CaptureError(f"{self.video.file}: {reason}", entry=self.video.file)
 
 
 @dataclass(frozen=True)
@@ -72,14 +105,7 @@ class MatchedFrames:
 
 
 def match_frames(
-    signatures: Signatures,
-    ticks: NDArray[np.int64],
-    tick: float,
-    program: Program,
-    light: resemblance.Light,
-    large: LargeFrames,
-    video: Video,
-    unfinished: bool,
+    signatures: Signatures, ticks: NDArray[np.int64], tick: float, large: LargeFrames, expected: Expected
 ) -> MatchedFrames:
     """Match the frames of a recording to the patterns of a program.
 
@@ -90,46 +116,27 @@ def match_frames(
         When each frame is shown.
     tick : float
         Length of a tick in seconds.
-    program : Program
-    light : (patterns, rows, columns, 3) float32
-        Of its patterns, see `resemblance.coarse_light`.
     large : LargeFrames
         Used with a border only.
-    video : Video
-        If it has a border, the patterns were shown in it, between a lead-in and a lead-out; see
-        `workflows.programs.border.schedule`.
-    unfinished : bool
-        Whether the program need not have been shown to its end: what was not is not missing.
+    expected : Expected
 
     Raises
     ------
     CaptureError
         If too little of the program is found.
     """
-
-    def refusal(reason: str) -> CaptureError:
-        return CaptureError(f"{video.file}: {reason}", entry=video.file)
-
-    rate, border = video.patterns_per_second, video.border
-    recording = Recording(signatures, (ticks - ticks[0]) * tick, 1 / rate)
+    program, border = expected.program, expected.video.border
+    recording = Recording(signatures, (ticks - ticks[0]) * tick, 1 / expected.rate)
     found = find_by_numbers(recording, large, border, program.count) if border is not None else None
     numbered = found is not None
     if found is None:
-        found = _by_timing(recording, rate, program, light, border is not None, refusal)
-    looks, score, odd = _compare(recording, found, program, light, border is not None)
-    reasons = dict(found.reasons)
-    for number in odd:
-        reasons[number] = Reason.ODD
-        del looks[number]
-    wrong = np.isin(program.constants[0], odd).mean() > 0.5
-    unlike = score is not None and score < MIN_RESEMBLANCE
-    if wrong or (unlike and not (numbered and resemblance.compared(program, looks) < MANY)):
-        raise refusal(
-            "what changes in the video does not look like the patterns of the program: check that capture.json has the "
-            "program that was shown and its patterns_per_second, and film from a tripod"
-        )
-    shown = max(looks, default=-1) + 1 if unfinished else program.count
-    _require_enough(program, shown, looks, reasons, rate, refusal)
+        found = _by_timing(recording, expected)
+    looks, score, odd = _compare(recording, found, expected)
+    looks = {number: look for number, look in looks.items() if number not in odd}
+    reasons = found.reasons | dict.fromkeys(odd, Reason.ODD)
+    _require_resemblance(expected, looks, odd, score, numbered)
+    shown = max(looks, default=-1) + 1 if expected.unfinished else program.count
+    _require_enough(expected, shown, looks, reasons)
     reasons = {number: reason for number, reason in sorted(reasons.items()) if number < shown}
     kept = sorted(looks)
     shares = {number: _shares(ticks[found.frames[number]], found.weights[number]) for number in kept}
@@ -151,59 +158,44 @@ def match_frames(
     return MatchedFrames(shares, record, notes)
 
 
-def _by_timing(
-    recording: Recording,
-    rate: float,
-    program: Program,
-    light: resemblance.Light,
-    has_lead: bool,
-    refusal: Refusal,
-) -> FoundPatterns:
+def _by_timing(recording: Recording, expected: Expected) -> FoundPatterns:
     """Find the frames of each pattern by the times of the changes, after a lead-in if there is one."""
     frames, begins, ends = slice(0, len(recording.times)), False, False
-    if has_lead:
+    if expected.has_border:
         frames, first, ends = lead_in.find_patterns(recording)
-        recording = Recording(recording.signatures[frames], recording.times[frames], 1 / rate)
+        recording = Recording(recording.signatures[frames], recording.times[frames], 1 / expected.rate)
         begins = first is not None
         if first is not None:
             lead_in.begin_at(recording, first)
+    count = expected.program.count
     if not recording.events and recording.noise.max(initial=0) > _RESTLESS:
-        raise refusal(
+        raise expected.refusal(
             "the picture changes from each frame to the next and never stands still: record more frames a second, show "
             "fewer patterns a second, and keep the camera at rest"
         )
     if not recording.events:
-        raise refusal("nothing changes in the video: film the monitor while it shows the program")
-    if len(recording.events) > _EVENTS * program.count + 100:
-        raise refusal(
-            f"the picture changes {len(recording.events)} times, but the program has {program.count} patterns: keep "
+        raise expected.refusal("nothing changes in the video: film the monitor while it shows the program")
+    if len(recording.events) > _EVENTS * count + 100:
+        raise expected.refusal(
+            f"the picture changes {len(recording.events)} times, but the program has {count} patterns: keep "
             "the camera, the light and the glass at rest, and cut off what does not belong to the program"
         )
-    found = _best(recording, rate, program, light, has_lead, begins, ends, refusal)
+    found = _best(recording, expected, begins, ends)
     start = found.start + float(recording.times[0])
     return replace(found, frames=[some + frames.start for some in found.frames], start=start)
 
 
-def _best(
-    recording: Recording,
-    rate: float,
-    program: Program,
-    light: resemblance.Light,
-    has_border: bool,
-    begins: bool,
-    ends: bool,
-    refusal: Refusal,
-) -> FoundPatterns:
+def _best(recording: Recording, expected: Expected, begins: bool, ends: bool) -> FoundPatterns:
     """Of the matches that fit the timing, choose the one that looks most like the program.
 
     The whole program is tried first, then all of it but its end or its beginning. If a lead-in or a lead-out was found,
     the program ``begins`` or ``ends`` with the first or the last event.
     """
-    flat = light.reshape(len(light), -1)
+    flat = expected.light.reshape(len(expected.light), -1)
     same = (flat[1:] == flat[:-1]).all(axis=1)
     for edges in EDGES:
         tried = [
-            find_by_timing(recording, rate, same, begin, end)
+            find_by_timing(recording, expected.rate, same, begin, end)
             for begin, end in edges
             if (begin == "seen" or not begins) and (end == "seen" or not ends)
         ]
@@ -211,51 +203,64 @@ def _best(
         if fitting:
             break
     else:
-        raise refusal(
-            f"the {len(recording.events)} changes in the video do not fit {program.count} patterns at {rate:g} a "
-            "second: check that capture.json has the program that was shown and its patterns_per_second, and record "
-            "all of it in one go, with everything at rest"
+        raise expected.refusal(
+            f"the {len(recording.events)} changes in the video do not fit {expected.program.count} patterns at "
+            f"{expected.rate:g} a second: check that capture.json has the program that was shown and its "
+            "patterns_per_second, and record all of it in one go, with everything at rest"
         )
     least = min(found.cost for found in fitting)
     likely = [found for found in fitting if found.cost <= least + _AS_LIKELY]
 
     def quality(found: FoundPatterns) -> float:
-        _, score, odd = _compare(recording, found, program, light, has_border)
+        _, score, odd = _compare(recording, found, expected)
         return (score or 0.0) - len(odd)
 
     return likely[0] if len(likely) == 1 else max(sorted(likely, key=lambda found: found.cost), key=quality)
 
 
 def _compare(
-    recording: Recording, found: FoundPatterns, program: Program, light: resemblance.Light, has_border: bool
+    recording: Recording, found: FoundPatterns, expected: Expected
 ) -> tuple[dict[int, Doubles], float | None, list[int]]:
     """What the camera saw of each pattern, in approximately linear light; the score of that; the odd patterns."""
+    program, light = expected.program, expected.light
     looks = {n: (recording.look(f) / 255) ** _GAMMA for n, f in enumerate(found.frames) if f.size}
-    if has_border:
+    if expected.has_border:
         looks = without_border(program, looks)
     return looks, resemblance.score(program, light, looks), resemblance.odd_patterns(program, light, looks)
 
 
+def _require_resemblance(
+    expected: Expected, looks: Mapping[int, Doubles], odd: list[int], score: float | None, numbered: bool
+) -> None:
+    """Require that most constant patterns are not odd, and that the others look right, or are few and ``numbered``."""
+    wrong = np.isin(expected.program.constants[0], odd).mean() > 0.5
+    unlike = score is not None and score < MIN_RESEMBLANCE
+    few = resemblance.compared(expected.program, looks) < MANY
+    if wrong or (unlike and not (numbered and few)):
+        raise expected.refusal(
+            "what changes in the video does not look like the patterns of the program: check that capture.json has the "
+            "program that was shown and its patterns_per_second, and film from a tripod"
+        )
+
+
 def _require_enough(
-    program: Program,
-    shown: int,
-    looks: Mapping[int, Doubles],
-    reasons: Mapping[int, Reason],
-    rate: float,
-    refusal: Refusal,
+    expected: Expected, shown: int, looks: Mapping[int, Doubles], reasons: Mapping[int, Reason]
 ) -> None:
     """Require black, white, and most of the other patterns, of the first that were ``shown``."""
-    numbers, sent = program.constants
+    numbers, sent = expected.program.constants
     there = np.isin(numbers, list(looks))
     why = "; ".join(_by_reason(reasons))
     if not there.any() or (np.ptp(sent[there], axis=0) < np.ptp(sent, axis=0) / 2).any():
-        raise refusal(f"the dark and bright constant patterns are not both found: {why}. Record it again")
-    measured = program.measured[program.measured < shown]
+        raise expected.refusal(
+            f"the dark and bright constant patterns are not both found: {why}. Record it again"
+        )
+    measured = expected.program.measured
+    measured = measured[measured < shown]
     share = float(np.isin(measured, list(looks)).mean()) if measured.size else 0.0
     if share < MIN_SHARE:
-        raise refusal(
+        raise expected.refusal(
             f"only {share:.0%} of the patterns are found: {why}. Record it again, at more frames a second, or show "
-            f"fewer than {rate:g} patterns a second"
+            f"fewer than {expected.rate:g} patterns a second"
         )
 
 
