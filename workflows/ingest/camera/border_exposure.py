@@ -41,6 +41,8 @@ LEAST_SWING = 0.03
 itself, in which black and white clip, some codes beside black are left."""
 TRIFLE = 0.003
 """A standard deviation of the exposures below this is none."""
+MOST_APART = 1.3
+"""Ratio of the exposures of the constant frames from which on they tell no curve: the camera was not locked."""
 
 Doubles = NDArray[np.float64]
 Scalar = TypeVar("Scalar", np.float32, np.float64)
@@ -225,3 +227,11 @@ def relative_to_white(exposures: Doubles, patterns: Sequence[int], program: Prog
     """
     white = shortest_white(exposures, patterns, program)
     return exposures if white is None else exposures / exposures[white]
+
+
+def is_free(exposed: Sequence[float] | NDArray[np.float64] | None) -> bool:
+    """Whether the exposure of a film was not locked.
+
+    Then errors of the exposures make more values brighter than white than noise does.
+    """
+    return exposed is not None and bool(np.max(exposed) > MOST_APART * np.min(exposed))

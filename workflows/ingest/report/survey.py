@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import light_of_codes
-from workflows.ingest.camera.border_exposure import BorderValues, shortest_white
-from workflows.ingest.camera.calibration import calibrate, constant_frames, is_free
+from workflows.ingest.camera.border_exposure import BorderValues, is_free, shortest_white
+from workflows.ingest.camera.calibration import calibrate, constant_frames
 from workflows.ingest.camera.lit import find_lit, windows
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of

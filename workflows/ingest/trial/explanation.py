@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from storage.layout.captures import Stack
-from workflows.ingest.camera.border_exposure import BorderLight, BorderValues
-from workflows.ingest.camera.calibration import calibrate, is_free
+from workflows.ingest.camera.border_exposure import BorderLight, BorderValues, is_free
+from workflows.ingest.camera.calibration import calibrate
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import look_up_of, monitor_curve_of
 from workflows.ingest.trial.covered import find_covered

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
-from workflows.ingest.camera.border_exposure import BorderValues
-from workflows.ingest.camera.calibration import is_free
+from workflows.ingest.camera.border_exposure import BorderValues, is_free
 from workflows.ingest.measured_light import black_patterns
 from workflows.ingest.trial.explanation import explain
 from workflows.ingest.trial.movement import smooth_path

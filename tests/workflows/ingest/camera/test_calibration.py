@@ -14,8 +14,8 @@ from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
 from workflows.images.integer_formats import decode, encode_png
 from workflows.images.tone_curves import table
-from workflows.ingest.camera.border_exposure import BorderValues
-from workflows.ingest.camera.calibration import MOST_APART, calibrate
+from workflows.ingest.camera.border_exposure import MOST_APART, BorderValues
+from workflows.ingest.camera.calibration import calibrate
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
 from workflows.recovery.camera.noise import NoiseModel
