@@ -61,11 +61,11 @@ def full_scale(transfer: int, brightest: NDArray[np.float32], darkest: NDArray[n
 def to_srgb(
     codes: NDArray[np.uint16], transfer: int, primaries: int, full: float = 1.0
 ) -> NDArray[np.uint16]:
-    """Convert RGB for HDR displays to sRGB.
+    """Convert RGB, or grey, for HDR displays to sRGB.
 
     Parameters
     ----------
-    codes : (height, width, 3) uint16
+    codes : (height, width, 3 or 1) uint16
         Full range.
     transfer : int
         `PQ` or `HLG`.
@@ -76,7 +76,7 @@ def to_srgb(
 
     Returns
     -------
-    (height, width, 3) uint16
+    (height, width, 3 or 1) uint16
     """
     light_of, code_of = light_of_hdr(transfer) / np.float32(full), _codes()
     found = np.empty_like(codes)
@@ -84,7 +84,7 @@ def to_srgb(
     for first in range(0, len(codes), rows):
         at = slice(first, first + rows)
         light = light_of[codes[at]]
-        if primaries == BT_2020:
+        if primaries == BT_2020 and codes.shape[2] == 3:
             light = light @ TO_SRGB.T
         found[at] = code_of[np.rint(np.clip(light, 0, 1) * np.float32(TOP)).astype(np.uint16)]
     return found

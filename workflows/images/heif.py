@@ -94,9 +94,10 @@ def decode(
     if deep:
         bits = int(_info(picture)["bit_depth"])
         pixels = (pixels << (16 - bits)) | (pixels >> (2 * bits - 16))
-    if is_for_hdr and pixels.shape[2] == 3:
-        codes = (pixels if deep else pixels * np.uint16(257)).astype(np.uint16, copy=False)
-        pixels = to_srgb(codes, stated["transfer_characteristics"], stated["color_primaries"], full)
+    if is_for_hdr:
+        pixels = (pixels if deep else pixels * np.uint16(257)).astype(np.uint16, copy=False)
+        colours = pixels[..., :3]  # without alpha, if there is one
+        colours[:] = to_srgb(colours, stated["transfer_characteristics"], stated["color_primaries"], full)
     # The library has turned it by the file's own orientation.
     if turn is not None and (own := orientation(data)) != turn:
         pixels = upright(upright(pixels, inverse(own)), turn)

@@ -89,6 +89,18 @@ def test_hdr_becomes_srgb(transfer: int, bits: int) -> None:
     np.testing.assert_array_equal(any_format.decode(data, "srgb", memory=MEMORY), expected)
 
 
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("channels", [1, 4])
+def test_grey_and_colours_beside_alpha_become_srgb_too(channels: int, bits: int) -> None:
+    pixels = PIXELS if bits == 8 else bits_of(bits)
+    pixels = np.dstack([pixels, pixels[..., :1]])[..., :channels]
+    plain = heif.decode(heic(pixels), memory=MEMORY)
+    full = (plain * np.uint16(257) if bits == 8 else plain).astype(np.uint16)
+    expected = np.dstack([hdr.to_srgb(full[..., :3], hdr.PQ, hdr.BT_2020), full[..., 3:]])
+    data = heic(pixels, color_primaries=hdr.BT_2020, transfer_characteristics=hdr.PQ)
+    np.testing.assert_array_equal(heif.decode(data, memory=MEMORY), expected)
+
+
 @pytest.mark.parametrize("pixels", [PIXELS, bits_of(10)])
 def test_the_limit_is_that_of_the_decoded_bytes(pixels: NDArray[Any]) -> None:
     data = heic(pixels)
