@@ -20,6 +20,7 @@ from distributed import Client, Future
 from distributed.scheduler import KilledWorker
 
 from services.cluster.task import key_of, run
+from storage.cluster_state import ClusterState, WorkerState
 from storage.errors import EnvmatteError
 from workflows.jobs import Steps, Task
 
@@ -124,8 +125,8 @@ class Dispatcher:
         self._thread = threading.Thread(target=self._watch, name="dispatcher")
         self.news = threading.Event()
         """Set when a tile may have an outcome, or the cluster may have changed."""
-        self.cluster: dict[str, Any] = {"workers": [], "problem": "the scheduler has not been reached yet"}
-        """As last seen: ``workers``, the number of tiles ``under_way``, and ``problem``, a sentence or None."""
+        self.cluster: ClusterState = {"workers": [], "problem": "the scheduler has not been reached yet"}
+        """As last seen."""
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -142,7 +143,7 @@ class Dispatcher:
     @property
     def threads(self) -> int:
         """Number of threads of all workers."""
-        return sum(worker["threads"] for worker in self.cluster["workers"])
+        return _threads_of(self.cluster)
 
     @property
     def free(self) -> int:
@@ -258,18 +259,17 @@ class Dispatcher:
             start = time.monotonic()
             cluster = self._poll()
             took = time.monotonic() - start
-            changed = cluster["problem"] != self.cluster["problem"] or self.threads != sum(
-                worker["threads"] for worker in cluster["workers"]
-            )
+            before, self.cluster = self.cluster, cluster
+            changed = (cluster["problem"], _threads_of(cluster)) != (before["problem"], _threads_of(before))
             if changed and cluster["problem"]:
                 logger.warning(cluster["problem"])
-            self.cluster = cluster
             if changed:
                 self.news.set()
             if self._stopped.wait(min(max(POLL, took / POLL_SHARE), LONGEST_PAUSE)):
                 return
 
-    def _poll(self) -> dict[str, Any]:
+    def _poll(self) -> ClusterState:
+        """The cluster as it is now, connected to again if the connection is lost."""
         client: Any
         try:
             client = self._usable()
@@ -303,7 +303,11 @@ def _topic_of(client: Client) -> str:
     return f"tiles-{client.id}"
 
 
-def _worker(address: str, found: dict[str, Any]) -> dict[str, Any]:
+def _threads_of(cluster: ClusterState) -> int:
+    return sum(worker["threads"] for worker in cluster["workers"])
+
+
+def _worker(address: str, found: dict[str, Any]) -> WorkerState:
     return {
         "address": address,
         "name": str(found["name"]),

@@ -148,7 +148,7 @@ class Coordinator:
             logger.info("%s runs the jobs from now on", self._name)
         without_store = [run.job for run in self._runs.values() if run.without_store]
         with self._writing() as c:
-            leases.renew(c, self._token, self._dispatcher.cluster | {"without_store": without_store})
+            leases.renew(c, self._token, {**self._dispatcher.cluster, "without_store": without_store})
         if now - self._deleted_at > DELETE:
             self._deleted_at = now
             self._housekeeping.submit(_logged, keep_reserve, self._engine)

@@ -8,10 +8,10 @@ never late: a lease that ends in more than `SECONDS` was written before the cloc
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy import Connection, insert, select, update
 
+from storage.cluster_state import EMPTY_CLUSTER, ClusterState
 from storage.database.dialects import clock
 from storage.database.tables import coordinator
 
@@ -33,17 +33,13 @@ class Heartbeat:
         The process that sent it; None if it has released the lease.
     seconds : float
         Its age; for a moment more if the clock has jumped.
-    cluster : dict
-        The cluster as the coordinator saw it: ``workers``, ``problem``, a text or None, and ``without_store``, the jobs
-        whose tiles cannot reach the store.
+    cluster : ClusterState
+        The cluster as the coordinator saw it.
     """
 
     holder: str | None
     seconds: float
-    cluster: dict[str, Any]
-
-
-EMPTY_CLUSTER: dict[str, Any] = {"workers": [], "problem": None}
+    cluster: ClusterState
 
 
 def acquire(connection: Connection, holder: str, *, seize: bool = False) -> int | None:
@@ -82,7 +78,7 @@ def require_held(connection: Connection, token: int) -> None:
         raise Superseded("another coordinator runs the jobs now")
 
 
-def renew(connection: Connection, token: int, cluster: dict[str, Any]) -> None:
+def renew(connection: Connection, token: int, cluster: ClusterState) -> None:
     """Renew the lease and store the state of the cluster.
 
     Raises

@@ -26,8 +26,7 @@ def trouble_of(heartbeat: Heartbeat | None) -> str | None:
             f"no coordinator has given a sign of life for {heartbeat.seconds:.0f} s; start `envmatte serve` or "
             "`envmatte coordinator`, or check that it can reach the database"
         )
-    problem: str | None = heartbeat.cluster["problem"]
-    return problem
+    return heartbeat.cluster["problem"]
 
 
 def reason(row: Row[Any], situation: Situation) -> str | None:

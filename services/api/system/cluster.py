@@ -6,6 +6,7 @@ from services.api.context import AdminContext
 from services.api.http.router import Router
 from services.api.jobs.wait_reason import trouble_of
 from storage import statistics
+from storage.cluster_state import EMPTY_CLUSTER
 from storage.database.engine import reading
 from storage.records import leases
 from storage.records.jobs import ACTIVE
@@ -73,7 +74,7 @@ def get_cluster(context: AdminContext) -> Cluster:
         active = [row for row in statistics.job_counts(c) if row.state in ACTIVE]
         missing = sum(statistics.missing_tiles(c).values())
         pace = statistics.tiles_per_second(c)
-    seen = (heartbeat or Heartbeat(None, 0, leases.EMPTY_CLUSTER)).cluster
+    seen = (heartbeat or Heartbeat(None, 0, EMPTY_CLUSTER)).cluster
     workers = [Worker.model_validate(worker) for worker in seen["workers"]]
     limits = [worker.memory_limit_bytes for worker in workers if worker.memory_limit_bytes]
     return Cluster(

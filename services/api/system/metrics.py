@@ -14,6 +14,7 @@ from services.api.context import AdminContext
 from services.api.http.router import Router
 from services.api.jobs.wait_reason import trouble_of
 from storage import statistics
+from storage.cluster_state import EMPTY_CLUSTER
 from storage.database.engine import reading
 from storage.records import captures, jobs, leases, mattes
 from storage.records.leases import Heartbeat
@@ -118,23 +119,21 @@ def _of_the_cluster(connection: Connection) -> Iterator[Metric]:
     """The cluster as its coordinator last saw it."""
     heartbeat = leases.last_heartbeat(connection)
     yield _one("trouble", "1 if jobs can't progress; GET /v1/cluster says why.", bool(trouble_of(heartbeat)))
-    cluster = (heartbeat or Heartbeat(None, 0, leases.EMPTY_CLUSTER)).cluster
+    cluster = (heartbeat or Heartbeat(None, 0, EMPTY_CLUSTER)).cluster
     workers = cluster["workers"]
     yield _one("workers", "Worker processes.", len(workers))
-    yield _one("threads", "Threads of all workers.", _sum(workers, "threads"))
-    yield _one("workers_memory_bytes", "Memory of all workers.", _sum(workers, "memory_bytes"))
+    yield _one("threads", "Threads of all workers.", sum(worker["threads"] for worker in workers))
+    memory = sum(worker["memory_bytes"] for worker in workers)
+    yield _one("workers_memory_bytes", "Memory of all workers.", memory)
     text = "Memory limit of all workers together; 0 if there is none."
-    yield _one("workers_memory_limit_bytes", text, _sum(workers, "memory_limit_bytes"))
+    limits = sum(worker["memory_limit_bytes"] or 0 for worker in workers)
+    yield _one("workers_memory_limit_bytes", text, limits)
     yield _one(
         "tiles_under_way", "Tiles and steps that the cluster is working on.", cluster.get("under_way", 0)
     )
     if heartbeat is not None:
         text = "Seconds since the last sign of life of a coordinator."
         yield _one("coordinator_last_sign_seconds", text, heartbeat.seconds)
-
-
-def _sum(workers: list[dict[str, Any]], name: str) -> int:
-    return sum(worker[name] or 0 for worker in workers)
 
 
 def _of_each(keys: Iterable[str], rows: Mapping[str, Any], column: str) -> Labelled:

@@ -4,6 +4,7 @@ import threading
 from typing import Any
 
 from services.cluster.dispatcher import Outcome
+from storage.cluster_state import EMPTY_CLUSTER
 from storage.errors import EnvmatteError
 
 
@@ -14,7 +15,7 @@ class Idle:
 
     def __init__(self) -> None:
         self.news = threading.Event()
-        self.cluster: dict[str, Any] = {}
+        self.cluster = EMPTY_CLUSTER
         self.submitted: list[tuple[str, int]] = []
         self.dropped: list[str] = []
         self.outcomes: list[Outcome] = []
@@ -58,7 +59,6 @@ class Working(Idle):
 
     def __init__(self) -> None:
         super().__init__()
-        self.cluster = {"workers": [], "problem": None}
         self.done: list[str] = []
 
     def collect(self) -> list[Outcome]:
@@ -73,7 +73,6 @@ class Failing(Idle):
     def __init__(self, error: EnvmatteError) -> None:
         super().__init__()
         self.error = error
-        self.cluster = {"workers": [], "problem": None}
         self.tried: list[tuple[str, int]] = []
 
     def collect(self) -> list[Outcome]:
