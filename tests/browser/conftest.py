@@ -14,6 +14,8 @@ from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+WINDOWLESS = shutil.which("chromium-headless-shell") or CHROMIUM
+"""Chromium without windows if it is there, in which a page takes a third of the processor time."""
 ARGUMENTS = [
     "--no-sandbox",  # tests may run as root; the pages are our own
     "--enable-unsafe-swiftshader",  # WebGL2 without a graphics card, and without a warning
@@ -42,10 +44,10 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 # Of a module: it keeps an event loop in this thread while it lives, so no other test could run one.
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    if CHROMIUM is None:
+    if WINDOWLESS is None:
         pytest.skip("pages are tested in Chromium, which is not installed: apt-get install chromium")
     with sync_playwright() as playwright:
-        yield (running := playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS))
+        yield (running := playwright.chromium.launch(executable_path=WINDOWLESS, args=ARGUMENTS))
         running.close()
 
 

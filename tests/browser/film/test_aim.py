@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, Page, expect
 from scipy import ndimage
 
-from tests.browser.conftest import ARGUMENTS, CHROMIUM
+from tests.browser.conftest import ARGUMENTS, WINDOWLESS
 from tests.browser.pages import MINUTE, opened
 from tests.end_to_end.conftest import Service
 from tests.parts.waiting import until
@@ -116,7 +116,7 @@ def filmed_screen(browser: Browser, tmp_path: Path) -> Iterator[Browser]:
     path = tmp_path / "camera.y4m"
     path.write_bytes(b"YUV4MPEG2 W640 H480 F10:1 Ip A1:1 C420jpeg\n" + 4 * one)
     running = browser.browser_type.launch(
-        executable_path=CHROMIUM, args=[*ARGUMENTS, f"--use-file-for-fake-video-capture={path}"]
+        executable_path=WINDOWLESS, args=[*ARGUMENTS, f"--use-file-for-fake-video-capture={path}"]
     )
     yield running
     running.close()

@@ -23,7 +23,7 @@ COUNTED = {"width": 800, "height": 450}
 def zoomed(tmp_path: Path) -> Iterator[Page]:
     """A page on a screen of 640 x 360 pixels, in a browser whose zoom is 125 %."""
     if CHROMIUM is None:
-        pytest.skip("pages are tested in Chromium, which is not installed: apt-get install chromium")
+        pytest.skip("pages are zoomed in Chromium, which is not installed: apt-get install chromium")
     preferences = tmp_path / "Default" / "Preferences"
     preferences.parent.mkdir()
     # Chromium counts its zoom in steps of 20 %.
