@@ -8,15 +8,22 @@ from pathlib import PurePosixPath
 import tifffile
 
 SUFFIXES = (
-    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos"),
-    *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
-)
+    ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw",
+    ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
+)  # fmt: skip
 """Extensions of RAW files."""
 MAGICS = (
-    *(b"FUJIFILMCCD-RAW", b"II*\0\x10\0\0\0CR", b"II\x1a\0\0\0HEAPCCDR", b"IIRO", b"IIRS", b"MMOR", b"IIU\0"),
-    *(b"FOVb", b"\0MRM"),
+    b"FUJIFILMCCD-RAW",  # Fuji
+    b"II*\0\x10\0\0\0CR",  # Canon CR2
+    b"II\x1a\0\0\0HEAPCCDR",  # Canon CRW
+    b"IIRO",  # Olympus, as the next two
+    b"IIRS",
+    b"MMOR",
+    b"IIU\0",  # Panasonic
+    b"FOVb",  # Sigma
+    b"\0MRM",  # Minolta
 )
-"""First bytes of RAW files that are no plain TIFF: of Fuji, Canon, Olympus, Panasonic, Sigma and Minolta."""
+"""First bytes of RAW files that are no plain TIFF."""
 CR3 = b"ftypcrx "
 """Bytes 4 to 12 of Canon's newer RAW."""
 FILTERED = {tifffile.PHOTOMETRIC.CFA, tifffile.PHOTOMETRIC.LINEAR_RAW}

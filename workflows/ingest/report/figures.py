@@ -89,6 +89,10 @@ class Noise(BaseModel):
     shot: float
 
 
+Source = Literal["given", "estimated", "assumed"]
+"""Where a tone curve is known from."""
+
+
 class ToneCurve(BaseModel):
     """A tone curve, and whether the capture states it, or it was estimated from constant levels, or is assumed.
 
@@ -98,7 +102,7 @@ class ToneCurve(BaseModel):
     """
 
     curve: CameraCurve
-    source: Literal["given", "estimated", "assumed"]
+    source: Source
     apart: float | None = None
 
 

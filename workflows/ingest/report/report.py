@@ -14,6 +14,7 @@ from workflows.ingest.report.figures import (
     Frames,
     Level,
     Noise,
+    Source,
     ToneCurve,
 )
 from workflows.ingest.report.findings import findings
@@ -38,20 +39,17 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
         Number of frames in the stack.
     """
     program = Program.model_validate(attributes["program"])
-    survey, noise, steadiness = attributes["survey"], attributes["noise"], attributes.get("steadiness") or {}
-    stated = {"monitor": program.monitor.response, "camera": attributes["response"]}
-    curves = {
-        name: ToneCurve(
-            curve=attributes[f"{name}_curve"],
-            source="assumed"
-            if name in attributes["assumed_curves"]
-            else "estimated"
-            if response == "unknown"
-            else "given",
-            apart=survey.get("halftones_apart") if name == "camera" else None,
+    quality = None
+    if not attributes.get("order"):
+        quality = expected(
+            program,
+            patterns_seen(attributes),
+            attributes["survey"],
+            model_error_of(attributes),
+            attributes.get("pattern_error"),
+            attributes.get("auto_exposure"),
         )
-        for name, response in stated.items()
-    }
+    survey, noise, steadiness = attributes["survey"], attributes["noise"], attributes.get("steadiness") or {}
     figures = Figures(
         frames=Frames(
             kept=frames,
@@ -75,18 +73,20 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
             shot=noise["shot"],
         ),
         crosstalk=attributes["crosstalk"],
-        **curves,
-        quality=None
-        if attributes.get("order")
-        else expected(
-            program,
-            patterns_seen(attributes),
-            survey,
-            model_error_of(attributes),
-            attributes.get("pattern_error"),
-            attributes.get("auto_exposure"),
-        ),
+        monitor=_curve("monitor", program.monitor.response, attributes),
+        camera=_curve("camera", attributes["response"], attributes, survey.get("halftones_apart")),
+        quality=quality,
         video=attributes.get("video"),
     )
     found = findings(figures, program, attributes)
     return Report(**dict(figures), level=max((f.level for f in found), key=LEVELS.index), findings=found)
+
+
+def _curve(name: str, stated: Any, attributes: dict[str, Any], apart: float | None = None) -> ToneCurve:
+    """The curve of the monitor or of the camera, and where it is known from."""
+    source: Source = "given"
+    if name in attributes["assumed_curves"]:
+        source = "assumed"
+    elif stated == "unknown":
+        source = "estimated"
+    return ToneCurve(curve=attributes[f"{name}_curve"], source=source, apart=apart)

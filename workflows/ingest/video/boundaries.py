@@ -6,6 +6,8 @@ least fits the known timing of the program best.
 """
 
 import math
+from collections.abc import Iterator, Sequence
+from itertools import chain, groupby
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -23,16 +25,21 @@ JITTER = 0.1
 """Standard deviation of the time that a pattern is shown, relative to that time."""
 ENOUGH = 0.7
 """The share of its time for which a pattern is certainly shown."""
-# Costs are negative log likelihoods.
+# Costs are negative log likelihoods, set by hand: 12 stands for odds of 1 to 160,000.
 _HIDDEN = 12.0  # of a boundary without an event, between patterns that differ
 _SAME = 0.5  # of a boundary without an event, between patterns that do not
-_JUNK = 8.0  # of an event without a boundary
+_JUNK, _FIRST_JUNK = 8.0, 3  # of each of the first events without a boundary in succession,
+_FURTHER_JUNK = 1.0  # and of each further one: what disturbs goes on
 _JUNK_OUTSIDE = 3.0  # of an event before the program or after it
-_MAX_JUNK = 24
+_REACH = 24  # events from one with a boundary to the next, at most
+_MORE = 2.0  # of each boundary but one in an event
 _EDGE = {"seen": 0.0, "hidden": 6.0, "cut": 40.0}
 # Boundaries that may be the first or the last one in an event, counted from that end of the program.
 _AT_EDGE = {"seen": slice(0, 1), "hidden": slice(1, 2), "cut": slice(1, None)}
 _ELBOW = 4.0  # standard deviations above which the cost of timing grows only linearly
+_CERTAIN = 3.0  # standard deviations that no time is off by
+_ALMOST = 0.3  # an event may hold a pattern that lacks this share of its time,
+_SHORTEST = 0.6  # and patterns that lack this share together
 
 
 class Step(NamedTuple):
@@ -76,55 +83,101 @@ def shortest_path(
     (list of Step, float) or None
         The events with boundaries in the order of time, and the cost; None if no path fits.
     """
-    n, times, options = len(same) + 1, recording.times, _options(recording, hold)
-    # Cost up to each boundary.
-    hidden = np.concatenate([[0, 0], np.cumsum(np.where(same, _SAME, _HIDDEN)), [np.inf]])
-    cost = np.full((len(options), n + 1), np.inf)
-    before = np.full((len(options), n + 1, 2), -1, np.int32)
-    begins = np.searchsorted([option.event for option in options], range(len(recording.events)))
+    options, times = _options(recording, hold), recording.times
+    paths = _Paths(options, same)
+    of_event = [list(some) for _, some in groupby(range(len(options)), lambda at: options[at].event)]
     for at, option in enumerate(options):
-        entry = np.full(n + 1, np.inf)  # as the first event with a boundary
         if _fits(begin, option.begin - times[0], hold, outside=option.event):
-            entry[_AT_EDGE[begin]] = _EDGE[begin]
-        more = option.boundaries - 1
-        cost[at, more:] = entry[: n + 1 - more] + option.cost + _JUNK_OUTSIDE * option.event
-        for event in range(option.event - 1, max(option.event - _MAX_JUNK, 0) - 1, -1):
-            junk = option.event - event - 1
-            last = begins[event + 1] if event + 1 < len(begins) else len(options)
-            for earlier in range(begins[event], last):
-                elapsed = option.begin - options[earlier].end
-                around = max(elapsed, 0.0) / hold
-                wide = math.ceil(1 + 3 * JITTER * math.sqrt(around))
-                for step in range(max(1, round(around) - wide), round(around) + wide + 1):
-                    to = step + more
-                    if to > n:
-                        break
-                    variance = options[earlier].variance + option.variance
-                    price = _late(elapsed - step * hold, hold, step, variance) + option.cost
-                    price += _JUNK * min(junk, 3) + max(junk - 3, 0)
-                    unseen = hidden[step : n + 1 - more] - hidden[1 : n + 2 - more - step]
-                    tried = cost[earlier, : n + 1 - to] + price + unseen
-                    better = tried < cost[at, to:]
-                    cost[at, to:][better] = tried[better]
-                    before[at, to:][better] = np.stack(
-                        [np.full(n + 1 - to, earlier), np.arange(n + 1 - to)], 1
-                    )[better]
-    ends = cost + np.array([_JUNK_OUTSIDE * (len(recording.events) - 1 - o.event) for o in options])[:, None]
+            paths.begin(at, begin)
+        near = of_event[max(option.event - _REACH, 0) : option.event]
+        for earlier in chain.from_iterable(reversed(near)):
+            for patterns, price in _prices(options[earlier], option, hold):
+                if patterns + option.boundaries - 1 > len(same) + 1:
+                    break
+                paths.extend(at, earlier, patterns, price)
+    ends = np.full_like(paths.cost, np.inf)
     for at, option in enumerate(options):
         outside = len(recording.events) - 1 - option.event
-        leave = np.full(n + 1, np.inf)
         if _fits(end, times[-1] - option.end, hold, outside):
-            leave[::-1][_AT_EDGE[end]] = _EDGE[end]
-        ends[at] += leave
+            ends[at] = paths.ends(at, end, outside)
     if not np.isfinite(ends).any():
         return None
-    at, index = (int(i) for i in np.unravel_index(np.argmin(ends), ends.shape))
-    steps, least = [], float(ends[at, index])
-    while at >= 0:
-        option = options[at]
-        steps.append(Step(option.event, index - option.boundaries + 1, index, option.begin, option.end))
-        at, index = (int(i) for i in before[at, index])
-    return steps[::-1], least
+    at, boundary = (int(i) for i in np.unravel_index(np.argmin(ends), ends.shape))
+    return paths.back_from(at, boundary), float(ends[at, boundary])
+
+
+class _Paths:
+    """The cheapest path to each boundary, for each option that it may be the last one in.
+
+    Parameters
+    ----------
+    options : sequence of _Option
+    same : (n - 1,) bool
+        As of `shortest_path`.
+
+    Attributes
+    ----------
+    cost : (options, n + 1) float64
+        Infinite where there is no path.
+    """
+
+    def __init__(self, options: Sequence[_Option], same: Bools) -> None:
+        n = len(same) + 1
+        self._options = options
+        # What it costs to hide all boundaries up to each one; the first and the last are never between others.
+        self._hidden = np.concatenate([[0, 0], np.cumsum(np.where(same, _SAME, _HIDDEN)), [np.inf]])
+        self.cost = np.full((len(options), n + 1), np.inf)
+        # The option and the boundary that a path comes from.
+        self._before = np.full((len(options), n + 1, 2), -1, np.int32)
+
+    def begin(self, at: int, edge: Edge) -> None:
+        """Begin paths with an option."""
+        option, size = self._options[at], self.cost.shape[1]
+        entry = np.full(size, np.inf)
+        entry[_AT_EDGE[edge]] = _EDGE[edge]
+        more = option.boundaries - 1
+        self.cost[at, more:] = entry[: size - more] + option.cost + _JUNK_OUTSIDE * option.event
+
+    def extend(self, at: int, earlier: int, patterns: int, price: float) -> None:
+        """Go from an earlier option to one whose first boundary is so many patterns later, where that is cheaper."""
+        size, more = self.cost.shape[1], self._options[at].boundaries - 1
+        to = patterns + more
+        unseen = self._hidden[patterns : size - more] - self._hidden[1 : size + 1 - more - patterns]
+        tried = self.cost[earlier, : size - to] + price + unseen
+        better = tried < self.cost[at, to:]
+        self.cost[at, to:][better] = tried[better]
+        came_from = np.stack([np.full(size - to, earlier), np.arange(size - to)], axis=1)
+        self._before[at, to:][better] = came_from[better]
+
+    def ends(self, at: int, edge: Edge, outside: int) -> NDArray[np.float64]:
+        """What paths cost that end with an option, ``outside`` events before the last one, (n + 1,)."""
+        leave = np.full(self.cost.shape[1], np.inf)
+        leave[::-1][_AT_EDGE[edge]] = _EDGE[edge]
+        cost: NDArray[np.float64] = self.cost[at] + _JUNK_OUTSIDE * outside + leave
+        return cost
+
+    def back_from(self, at: int, boundary: int) -> list[Step]:
+        """The cheapest path to a boundary, from its beginning."""
+        steps = []
+        while at >= 0:
+            option = self._options[at]
+            first = boundary - option.boundaries + 1
+            steps.append(Step(option.event, first, boundary, option.begin, option.end))
+            at, boundary = (int(i) for i in self._before[at, boundary])
+        return steps[::-1]
+
+
+def _prices(earlier: _Option, option: _Option, hold: float) -> Iterator[tuple[int, float]]:
+    """How many patterns may be shown from one option to another, ascending, and what each number costs."""
+    elapsed = option.begin - earlier.end
+    around = max(elapsed, 0.0) / hold
+    wide = math.ceil(1 + _CERTAIN * JITTER * math.sqrt(around))
+    junk = option.event - earlier.event - 1
+    disturbed = _JUNK * min(junk, _FIRST_JUNK) + _FURTHER_JUNK * max(junk - _FIRST_JUNK, 0)
+    variance = earlier.variance + option.variance
+    for patterns in range(max(1, round(around) - wide), round(around) + wide + 1):
+        late = _late(elapsed - patterns * hold, hold, patterns, variance)
+        yield patterns, late + option.cost + disturbed
 
 
 def _options(recording: Recording, hold: float) -> list[_Option]:
@@ -135,12 +188,12 @@ def _options(recording: Recording, hold: float) -> list[_Option]:
     options = []
     for n, (event, span) in enumerate(zip(recording.events, spans, strict=True)):
         whole = (span - usual) / hold
-        for count in range(1, 1 + max(1, 2 + math.floor(whole + 0.3))):
+        for count in range(1, 1 + max(1, 2 + math.floor(whole + _ALMOST))):
             if count < whole - 1:
                 continue
             slack = span - usual - (count - 1) * hold
             short, free = max(-slack, 0) / hold, max(slack, 0)
-            if count > 1 and short > 0.6:
+            if count > 1 and short > _SHORTEST:
                 continue
             options.append(
                 _Option(
@@ -149,7 +202,7 @@ def _options(recording: Recording, hold: float) -> list[_Option]:
                     float(times[event.first]) + min(usual, span) / 2 + free / 2,
                     float(times[event.last]) - min(usual, span) / 2 - free / 2,
                     (free**2 + (usual / 2) ** 2) / 12,
-                    2.0 * (count - 1) + (short / JITTER) ** 2 / 2,
+                    _MORE * (count - 1) + (short / JITTER) ** 2 / 2,
                 )
             )
     return options
@@ -160,7 +213,7 @@ def _fits(edge: Edge, time: float, hold: float, outside: int) -> bool:
     if edge == "hidden":
         return time > ENOUGH * hold
     # A recording cut within a pattern shows nothing else, and stands still for no longer than a pattern.
-    return edge == "seen" or (outside == 0 and time < (1 + 3 * JITTER) * hold)
+    return edge == "seen" or (outside == 0 and time < (1 + _CERTAIN * JITTER) * hold)
 
 
 def _late(late: float, hold: float, holds: int, variance: float) -> float:
