@@ -22,7 +22,6 @@ from workflows.images.resample import area_mean
 from workflows.images.tone_curves import to_light
 from workflows.ingest.report.findings import Finding
 from workflows.ingest.report.report import report
-from workflows.ingest.trial import steadiness
 from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
 from workflows.mattes.tiles import patterns_of
@@ -207,50 +206,6 @@ def test_scaled_patterns_do_not_flicker_and_are_recovered_as_the_monitor_interpo
     assert as_shown > as_made + 4
 
 
-OFF = np.random.default_rng(0).normal(0, 0.1, (20, 3))
-ALL = np.ones(20, bool)
-
-
-@pytest.mark.parametrize(("with_gains", "rounds"), [(True, 2), (False, 1)])
-def test_rounds_end_when_what_is_searched_for_has_settled(with_gains: bool, rounds: int) -> None:
-    tried: list[NDArray[np.float64]] = []
-
-    def again(state: NDArray[np.float64]) -> steadiness.Trial:
-        tried.append(state)
-        gain = 0.1 if len(tried) == 1 else 0
-        return steadiness.Trial(OFF * [0.001, 0.001, gain], np.ones_like(OFF), 1.0)
-
-    first = steadiness.Trial(OFF, np.ones_like(OFF), 2.0)
-    steadiness._settle(again, np.zeros_like(OFF), first, ALL, with_gains)
-    assert len(tried) == rounds
-
-
-@pytest.mark.parametrize(
-    ("left", "best"),
-    [
-        ([2.1, 2.0], 1),
-        ([1.6, 1.3, 1.2, 1.3, 1.25], 2),
-        ([1.9, 2.1, 1.8, 1.797, 1.796], 4),
-        ((2 * 0.99 ** np.arange(1, steadiness.ROUNDS + 1)).tolist(), steadiness.ROUNDS - 1),
-    ],
-)
-def test_where_nothing_settles_rounds_end_when_they_explain_no_more_and_the_best_counts(
-    left: list[float], best: int
-) -> None:
-    tried: list[NDArray[np.float64]] = []
-
-    def again(state: NDArray[np.float64]) -> steadiness.Trial:
-        tried.append(state)
-        # turned, so that what is left is no multiple of what was found
-        return steadiness.Trial(np.roll(OFF, len(tried), axis=0), np.ones_like(OFF), left[len(tried) - 1])
-
-    first = steadiness.Trial(OFF, np.ones_like(OFF), 2.0)
-    state, trial, _ = steadiness._settle(again, np.zeros_like(OFF), first, ALL, True)
-    assert len(tried) == len(left)
-    assert trial.residual == left[best]
-    assert state is tried[best]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("ball", ["quick"], indirect=True)
 def test_light_that_follows_the_patterns_is_named_tone_mapping(ingest: Ingest, ball: Ball) -> None:
@@ -271,18 +226,3 @@ def test_too_small_a_frame_tells_nothing(ingest: Ingest) -> None:
     stack = ingest("c", target.getvalue())
     assert stack.attributes["steadiness"] is None
     assert stack.attributes["shifts"] is stack.attributes["gains"] is None
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "believed"),
-    [
-        (3.0, 1.2, [True, True]),
-        (4.0, 2.0, [True, False]),  # gains explain more than shifts
-        (1.5, 1.4, [False, False]),  # most is left
-        (1.09, 1.04, [True, True]),  # half is left, but of nothing
-    ],
-)
-def test_corrections_that_explain_the_frames_are_believed(
-    before: float, after: float, believed: list[bool]
-) -> None:
-    assert steadiness._believed(before, after).tolist() == believed
