@@ -150,6 +150,7 @@ def _examine_stills(decoder: Decoder, archive: CaptureArchive) -> _Frames:
         # One orientation for all frames: a camera that looks down detects its orientation at random.
         "orientation": header.orientation,
         "half_colour": header.half_colour,
+        "stated_exposures": stills.exposures(decoder, archive),
     }
     storage = stills.storage_of(decoder, archive, first, header.transfer)
     return _Frames((len(frames), height, width, channels), storage, attributes, None, [])

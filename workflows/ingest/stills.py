@@ -14,6 +14,7 @@ from workflows.images.float_formats import Floats
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import BLACK, table
 from workflows.ingest.archive import CaptureArchive
+from workflows.ingest.camera.stated_exposure import stated_exposure
 from workflows.ingest.manifest import MANIFEST, Manifest
 from workflows.untrusted.decoder import Decoder, blaming
 
@@ -87,6 +88,14 @@ class Header(BaseModel):
     transfer: Annotated[int, Field(ge=0, le=0xFFFF)]
 
 
+class Exposure(BaseModel):
+    """What a frame's file says of its exposure, 0 for nothing."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+    exposure: Annotated[float, Field(ge=0)]
+
+
 def header(decoder: Decoder, archive: CaptureArchive, entry: str) -> Header:
     """Read what a frame's file says of itself.
 
@@ -99,6 +108,23 @@ def header(decoder: Decoder, archive: CaptureArchive, entry: str) -> Header:
     with blaming(entry, decoder), decoder.checking():
         (found,) = decoder.run(_header, data, entry=entry)
         return Header.model_validate(found)
+
+
+def exposures(decoder: Decoder, archive: CaptureArchive) -> list[float] | None:
+    """The exposure that each frame's file states, see `workflows.ingest.camera.stated_exposure`.
+
+    None if not all state one, or if capture.json tells exposures apart.
+    """
+    frames, found = archive.manifest.frames, list[float]()
+    if len({frame.exposure for frame in frames}) > 1:
+        return None
+    for frame in frames:
+        with archive.open(frame.file) as file, blaming(frame.file, decoder), decoder.checking():
+            (stated,) = decoder.run(_exposure, file)
+            found.append(Exposure.model_validate(stated).exposure)
+        if not found[-1]:
+            return None
+    return found
 
 
 def read(
@@ -221,6 +247,10 @@ def _header(file: BinaryIO, entry: str) -> Iterator[dict[str, Any]]:
         "half_colour": not raw and integer_formats.halves_colour(data),
         "transfer": 0 if raw else integer_formats.transfer(data),
     }
+
+
+def _exposure(file: BinaryIO) -> Iterator[dict[str, float]]:
+    yield {"exposure": stated_exposure(file)}
 
 
 def _decode(

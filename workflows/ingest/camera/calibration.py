@@ -21,6 +21,7 @@ from workflows.ingest.camera.border_exposure import TRIFLE, BorderValues, is_fre
 from workflows.ingest.camera.curve import are_scaled, fit_camera_curve
 from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.camera.sample import FRAMES, FilmedPixels, HalftoneCodes, Sample
+from workflows.ingest.camera.stated_exposure import automatic_exposures
 from workflows.ingest.local_gain import Surroundings, local_gain
 from workflows.ingest.measured_light import clipped_from, exposures_of
 from workflows.programs.program import Program
@@ -163,8 +164,8 @@ def _camera(
     border: BorderValues | None,
     gain: Surroundings | None,
 ) -> tuple[CameraCurve | Literal["unknown"], NDArray[np.float64] | None, bool]:
-    """The camera's curve, or that of each channel; the exposure of each frame of a film by its border, (frames,), if it
-    varied; whether the monitor showed the patterns at another size.
+    """The camera's curve, or that of each channel; the exposure of each frame by a film's border, or as stills state
+    it, (frames,), if it varied; whether the monitor showed the patterns at another size.
 
     An unknown curve is measured if the program shows half-tones. It and the exposures are found in turn.
     """
@@ -172,7 +173,7 @@ def _camera(
     camera = TypeAdapter[Response](Response).validate_python(stack.attributes["response"])
     stated = camera != "unknown"
     halftones = HalftoneCodes.of(stack, program, sample)
-    exposed: NDArray[np.float64] | None = None
+    exposed = automatic_exposures(stack.attributes.get("stated_exposures"))
     scaled = False
     for _ in range(TURNS if border else 1):
         look_up = table(

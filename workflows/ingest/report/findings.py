@@ -49,7 +49,9 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         # What followed the camera's own exposure is corrected.
         *constants(None if attributes.get("auto_exposure") else attributes.get("constants_apart"), files),
         *_exposure(figures, attributes["storage"]),
-        *_auto_exposure(attributes.get("auto_exposure"), costs["auto_exposure"]),
+        *_auto_exposure(
+            attributes.get("auto_exposure"), costs["auto_exposure"], filmed=figures.video is not None
+        ),
         *_tone_mapping(attributes.get("tone_mapping")),
         *_steadiness(attributes.get("steadiness")),
         *_drift(figures.drift),
@@ -208,7 +210,7 @@ def _flicker(flicker: Flicker | None, files: list[str] | None, *, mapped: bool) 
     ]
 
 
-def _auto_exposure(exposed: list[float] | None, cost: float) -> list[Finding]:
+def _auto_exposure(exposed: list[float] | None, cost: float, *, filmed: bool) -> list[Finding]:
     if exposed is None:
         return []
     usual = float(np.median(exposed))
@@ -218,12 +220,17 @@ def _auto_exposure(exposed: list[float] | None, cost: float) -> list[Finding]:
         Finding(
             name="auto_exposure",
             level=level,
-            message=f"the camera's exposure changed by up to {100 * most:.0f} % from pattern to pattern, as the border "
-            "shows: recovery follows it",
+            message=f"the camera's exposure changed by up to {100 * most:.0f} % from pattern to pattern, "
+            + ("as the border shows" if filmed else "as its files state")
+            + ": recovery follows it",
             cost=cost or None,
             remedy=""
             if level == "good"
-            else "lock exposure and ISO before filming"
+            else (
+                "lock exposure and ISO before filming"
+                if filmed
+                else "set exposure and ISO by hand for all stills"
+            )
             + (
                 ": so large a change is followed only in part, and hides the camera's curve"
                 if level == "bad"

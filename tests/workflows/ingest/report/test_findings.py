@@ -39,6 +39,8 @@ def cases(attributes: dict[str, Any]) -> list[tuple[dict[str, Any], str, str | N
     def exposed(least: float, most: float) -> dict[str, Any]:
         return {"auto_exposure": [least, most, *np.ones(frames - 2).tolist()]}
 
+    film = {"video": {"missing": {}}}
+
     black = surveyed("black", clipped_low=0.4)
     mapped = {"tone_mapping": {"power": 0.2, "spread": 0.1}}
     following = steadiness(flicker=FLICKER | {"follows": -0.5})
@@ -77,8 +79,9 @@ def cases(attributes: dict[str, Any]) -> list[tuple[dict[str, Any], str, str | N
         ({"glare": [0.02, 0.02]}, "glare", "warning", "clean the lens"),
         ({"glare": [0.2, 0.2]}, "glare", "bad", "clean the lens"),
         (exposed(0.98, 1.02), "auto_exposure", "good", ""),
-        (exposed(0.9, 1.0), "auto_exposure", "warning", "lock exposure"),
-        (exposed(1.0, 1.3), "auto_exposure", "bad", "followed only in part"),
+        (film | exposed(0.9, 1.0), "auto_exposure", "warning", "lock exposure"),
+        (film | exposed(1.0, 1.3), "auto_exposure", "bad", "followed only in part"),
+        (exposed(1.0, 1.3), "auto_exposure", "bad", "by hand for all stills: so large"),
         ({"crosstalk": [[1, 0.35, 0], [0, 1, 0], [0, 0, 1]]}, "crosstalk", "warning", ""),
         ({"scaled": True}, "scaling", "warning", "Ctrl+0"),
         ({"survey": survey | {"deviation": survey["contrast"] / 20}}, "noise", "warning", "expose longer"),
