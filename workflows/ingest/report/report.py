@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from workflows.ingest.measured_light import patterns_seen
-from workflows.ingest.report.expected_psnr import expected, model_error_of
+from workflows.ingest.report.expected_psnr import expected, left_of, model_error_of
 from workflows.ingest.report.figures import (
     LEVELS,
     Clipping,
@@ -48,6 +48,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
             model_error_of(attributes),
             attributes.get("pattern_error"),
             attributes.get("auto_exposure"),
+            left_of(program, attributes),
         )
     survey, noise, steadiness = attributes["survey"], attributes["noise"], attributes.get("steadiness") or {}
     figures = Figures(
