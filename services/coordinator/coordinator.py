@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from itertools import chain
-from typing import Any
+from typing import Any, ParamSpec
 
 from sqlalchemy import Connection, Engine, Row
 
@@ -43,6 +43,7 @@ from storage.records import jobs, leases, tiles
 from storage.records.leases import Superseded
 
 logger = logging.getLogger(__name__)
+P = ParamSpec("P")
 
 POLL = 0.1
 """Seconds between two reads of the ledger. News from the cluster is handled at once."""
@@ -224,11 +225,11 @@ class Coordinator:
         for row in _batch([row for row in cancelled if row.kind in JOB_KINDS]):
             self._guarded(row.id, self._undo_cancelled, row)
 
-    def _guarded(self, job: str, act: Any, *arguments: Any) -> None:
+    def _guarded(self, job: str, act: Callable[P, object], *arguments: P.args, **more: P.kwargs) -> None:
         """Do something about a job, whose errors must not hold up other jobs."""
         try:
             with about(job):
-                act(*arguments)
+                act(*arguments, **more)
         except (Superseded, Unavailable, NoRoom):  # of the ledger: the job is not to blame
             raise
         except EnvmatteError as error:

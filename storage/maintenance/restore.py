@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from sqlalchemy import Connection, Engine, MetaData, select
 
@@ -97,14 +97,31 @@ def restore(
     return {"objects": manifest.objects, "bytes": manifest.bytes, "rows": count}
 
 
+class Entry(NamedTuple):
+    """An object of the backup, or its ledger, as the manifest describes it.
+
+    Attributes
+    ----------
+    name : str
+        Of the object in the store.
+    size : int
+        In bytes.
+    sha256 : str
+        In hexadecimal digits.
+    """
+
+    name: str
+    size: int
+    sha256: str
+
+
 class Manifest:
     """The manifest of a backup; iterating over it yields the entry of each object.
 
     Attributes
     ----------
     revision : str
-    ledger : dict
-        ``size`` and ``sha256`` of the ledger.
+    ledger : Entry
     objects, bytes : int
 
     Raises
@@ -125,10 +142,8 @@ class Manifest:
                     f"the backup has the format {header.get('format')!r}, but this envmatte reads {FORMAT!r}; "
                     "install the envmatte that made it"
                 )
-            self.revision, self.ledger = (
-                str(header.get("revision")),
-                _entry(header.get("ledger"), named=False),
-            )
+            self.revision = str(header.get("revision"))
+            self.ledger = _ledger_entry(header.get("ledger"))
             migrations.require_known(self.revision, "the backup")
             self._check_complete()
         except FileNotFoundError as error:
@@ -148,16 +163,16 @@ class Manifest:
             if before:
                 digest.update(before)
                 if self.objects >= 0:
-                    self.bytes += _entry(_object(before))["size"]
+                    self.bytes += _object_entry(_object(before)).size
                 self.objects += 1
             before = line
         last = {"objects": self.objects, "bytes": self.bytes, "sha256": digest.hexdigest()}
         if _object(before) != last:
             raise _incomplete()
 
-    def __iter__(self) -> Iterator[dict[str, Any]]:
+    def __iter__(self) -> Iterator[Entry]:
         for line in islice(self._lines(), 1, self.objects + 1):
-            yield _entry(_object(line))
+            yield _object_entry(_object(line))
 
 
 def _object(line: bytes) -> dict[str, Any]:
@@ -174,24 +189,30 @@ def _incomplete() -> InvalidInput:
     return InvalidInput(f"{MANIFEST} of the backup is incomplete or was changed; use another backup")
 
 
-def _entry(given: Any, *, named: bool = True) -> dict[str, Any]:
-    """A valid entry of an object, or of the ledger, in the manifest."""
-    name, size, digest = (
-        (given.get(key) for key in ("name", "size", "sha256")) if isinstance(given, dict) else (None,) * 3
-    )
-    if named and not (isinstance(name, str) and NAME.fullmatch(name)):
+def _object_entry(given: dict[str, Any]) -> Entry:
+    name = given.get("name")
+    if not (isinstance(name, str) and NAME.fullmatch(name)):
         raise InvalidInput(f"{MANIFEST} of the backup has the invalid object name {name!r}")
+    return _entry(name, given)
+
+
+def _ledger_entry(given: Any) -> Entry:
+    return _entry(LEDGER, given if isinstance(given, dict) else {})
+
+
+def _entry(name: str, given: dict[str, Any]) -> Entry:
+    size, digest = given.get("size"), given.get("sha256")
     if not (isinstance(size, int) and size >= 0 and isinstance(digest, str) and SHA256.fullmatch(digest)):
-        raise InvalidInput(f"{MANIFEST} of the backup has no valid size and checksum for {name or LEDGER}")
-    return {"name": name or LEDGER, "size": size, "sha256": digest}
+        raise InvalidInput(f"{MANIFEST} of the backup has no valid size and checksum for {name}")
+    return Entry(name, size, digest)
 
 
 def _copy(
     source: Objects, objects: Objects, manifest: Manifest, progress: Callable[[float, int], None]
 ) -> None:
-    def one(entry: dict[str, Any]) -> int:
-        objects.write_raw(entry["name"], _read(source, f"{OBJECTS}/{entry['name']}", entry))
-        return int(entry["size"])
+    def one(entry: Entry) -> int:
+        objects.write_raw(entry.name, _read(source, f"{OBJECTS}/{entry.name}", entry))
+        return entry.size
 
     done, entries = 0, iter(manifest)
     with ThreadPoolExecutor(THREADS, thread_name_prefix="restoring") as pool:
@@ -201,31 +222,31 @@ def _copy(
             progress(done / max(manifest.bytes, 1), done)
 
 
-def _read(source: Objects, path: str, entry: dict[str, Any]) -> Iterator[bytes]:
+def _read(source: Objects, path: str, entry: Entry) -> Iterator[bytes]:
     """The pieces of an object of the backup, see `_checked`."""
     try:
-        if entry["size"] <= PART:  # true of most objects, which take one request then
-            yield from _checked(entry, iter([source.read_raw(path, entry["size"])]))
+        if entry.size <= PART:  # true of most objects, which take one request then
+            yield from _checked(entry, iter([source.read_raw(path, entry.size)]))
         else:
             with source.reader(path) as reader:
                 yield from _checked(entry, iter(lambda: reader.read(PART), b""))
     except FileNotFoundError as error:
         raise InvalidInput(
-            f"{entry['name']} is missing in the backup; use another backup", entry=entry["name"]
+            f"{entry.name} is missing in the backup; use another backup", entry=entry.name
         ) from error
     except Corrupt as error:
-        raise _mismatch(entry["name"]) from error
+        raise _mismatch(entry.name) from error
 
 
-def _checked(entry: dict[str, Any], pieces: Iterator[bytes]) -> Iterator[bytes]:
+def _checked(entry: Entry, pieces: Iterator[bytes]) -> Iterator[bytes]:
     """The pieces of an object; raises after the last if they do not match the manifest."""
     tally = Tally()
     for piece in tally.passing(pieces):
-        if tally.size > entry["size"]:
-            raise _mismatch(entry["name"])
+        if tally.size > entry.size:
+            raise _mismatch(entry.name)
         yield piece
-    if (tally.size, tally.sha256) != (entry["size"], entry["sha256"]):
-        raise _mismatch(entry["name"])
+    if (tally.size, tally.sha256) != (entry.size, entry.sha256):
+        raise _mismatch(entry.name)
 
 
 def _mismatch(name: str) -> InvalidInput:
