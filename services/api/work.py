@@ -188,40 +188,18 @@ async def run(
     """
     if await request.is_disconnected():
         raise ClientDisconnect
-    unwanted = threading.Event()
-    large = any(amount >= LARGE for _, amount in needed)
-
-    def interruptibly() -> T:
-        end = time.monotonic() + seconds
-
-        def check() -> None:
-            if unwanted.is_set():
-                raise ClientDisconnect
-            if time.monotonic() > end:
-                raise InvalidInput(
-                    f"the answer takes more than {seconds:g} s to compute; ask for less, or raise "
-                    "ENVMATTE_REQUEST_SECONDS",
-                    name="request_seconds",
-                    limit=seconds,
-                )
-
-        try:
-            with interruptible(check):
-                return work()
-        finally:
-            if large:
-                return_free()
-
-    begun = False
+    unwanted, begun = threading.Event(), threading.Event()
     last = time.monotonic() + seconds
 
     async def in_turn() -> T:
-        nonlocal begun
         async with AsyncExitStack() as taken:
             for shares, amount in needed:
                 await taken.enter_async_context(shares.take(owner, last - time.monotonic(), amount))
-            begun = True
-            return await anyio.to_thread.run_sync(interruptibly, limiter=anyio.CapacityLimiter(1))
+            begun.set()
+            here = partial(_interruptibly, work, seconds, unwanted)
+            if any(amount >= LARGE for _, amount in needed):
+                here = partial(_returning_memory, here)
+            return await anyio.to_thread.run_sync(here, limiter=anyio.CapacityLimiter(1))
 
     answer, left = asyncio.create_task(in_turn()), asyncio.create_task(_disconnected(request))
     answer.add_done_callback(lambda task: task.cancelled() or task.exception())  # nobody else may ask for it
@@ -229,15 +207,42 @@ async def run(
         await asyncio.wait((answer, left), return_when=asyncio.FIRST_COMPLETED)
         if not answer.done():
             unwanted.set()
-            if not begun:
+            if not begun.is_set():
                 raise ClientDisconnect
             await asyncio.wait((answer,))  # it may still use what its request cleans up
         return answer.result()
     finally:
         left.cancel()
         unwanted.set()
-        if not begun:
+        if not begun.is_set():
             answer.cancel()
+
+
+def _interruptibly(work: Callable[[], T], seconds: float, unwanted: threading.Event) -> T:
+    """Do work that ends at a `checkpoint` once it is unwanted, or takes too long."""
+    end = time.monotonic() + seconds
+
+    def check() -> None:
+        if unwanted.is_set():
+            raise ClientDisconnect
+        if time.monotonic() > end:
+            raise InvalidInput(
+                f"the answer takes more than {seconds:g} s to compute; ask for less, or raise "
+                "ENVMATTE_REQUEST_SECONDS",
+                name="request_seconds",
+                limit=seconds,
+            )
+
+    with interruptible(check):
+        return work()
+
+
+def _returning_memory(work: Callable[[], T]) -> T:
+    """Do work, and return what it has freed to the machine."""
+    try:
+        return work()
+    finally:
+        return_free()
 
 
 async def _disconnected(request: Request) -> None:
