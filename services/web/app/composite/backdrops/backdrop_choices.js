@@ -1,0 +1,36 @@
+// What can be a backdrop: a built-in one, the camera, or a file that is dropped, pasted or chosen.
+import { fileField, h } from "../../lib/dom.js";
+import { STILLS, isFilm } from "../../upload/archive.js";
+import { onDrop } from "../../upload/upload.js";
+import { builtIn, fromFile } from "./backdrops.js";
+import { NAMES, scenery } from "./scenery.js";
+import { cameraSymbol, choice, thumbOf, thumbs } from "./thumb_choices.js";
+import { cameraBackdrop, clipBackdrop } from "./video_backdrops.js";
+import { parts, t } from "../../lib/words.js";
+
+// `use(promise, control)` shows a backdrop, and resolves with it if it can be used; `all` makes composites of several
+// files. Files can be dropped on the stage's element, too. `first` is the built-in one that is checked.
+export function backdropChoices(matte, stage, { use, all, first }, signal) {
+	const builtIns = NAMES.map((name) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, name === first, (control) => use(builtIn(name, matte.monitor), control)));
+	const choices = thumbs(t("backdrop"), [...builtIns, choice("backdrop", t("camera"), cameraSymbol(), false, (control) => use(cameraBackdrop(), control))]);
+	let own; // the choice of the last file
+	const take = async (files) => {
+		if (files.length > 1) return all([...files]);
+		const [file] = files;
+		const open = () => (isFilm(file) ? clipBackdrop(file) : fromFile(file));
+		const place = h("span");
+		const next = choice("backdrop", file.name || t("backdrop.pasted"), place, false, (control) => use(open(), control));
+		const control = next.querySelector("input");
+		const taken = await use(open(), control);
+		if (!taken) return;
+		own?.remove();
+		choices.lastChild.append((own = next));
+		place.replaceWith(thumbOf(taken));
+		control.checked = true;
+	};
+	const input = fileField({ id: "backdrop", multiple: true, accept: `${STILLS},video/*,.mts,.m2ts` }, take);
+	onDrop(stage, take);
+	addEventListener("paste", ({ clipboardData }) => clipboardData?.files.length && take(clipboardData.files), { signal });
+	return [choices, h("div.drop.small", h("label", { for: "backdrop" }, parts("backdrop.drop", { own: h("strong", t("backdrop.own")) }),
+		h("span.hint", t("backdrop.what"))), input)];
+}
