@@ -16,7 +16,7 @@ from services.api.http.bodies import read_json, schema_of, store_as_upload, uplo
 from services.api.http.idempotency import IdempotencyKey, find_earlier, idempotent
 from services.api.http.media_types import JSON, ZIP, media_type_of
 from services.api.http.router import Router
-from services.api.limits.quotas import admit
+from services.api.limits.quotas import NewData, admit
 from services.api.limits.reservations import reserved
 from services.runtime import tracing
 from services.runtime.problems import WrongMediaType
@@ -112,7 +112,8 @@ async def _from_body(
     capture = new_id()
     most = context.settings.upload_bytes
     remove = partial(stored_uploads.remove, context.objects, capture)
-    async with reserved(context, capture, length, most, remove=remove, captures=1, jobs=1) as reservation:
+    wanted = NewData(captures=1, jobs=1, size=length)
+    async with reserved(context, capture, wanted, most, remove) as reservation:
         pieces = reservation.watch(limit.stream(request))
         parts = [await store_as_upload(pieces, context.objects, capture)]
         register = partial(_register, context, capture, parts, key, name=name, webhook=webhook)

@@ -26,7 +26,7 @@ from services.api.http.bodies import BodyLimit, has_body, upload_limit
 from services.api.http.idempotency import IdempotencyKey
 from services.api.http.media_types import require_media_type
 from services.api.http.router import Router
-from services.api.limits.quotas import admit_bytes, admit_upload
+from services.api.limits.quotas import NewData, admit_bytes, admit_upload
 from services.api.limits.reservations import STEP, Reservation
 from services.runtime.problems import Unauthorized
 from storage.database.engine import reading, writing
@@ -261,7 +261,7 @@ def _create(context: Context, length: int, metadata: str, key: str | None) -> tu
         row = uploads.by_key(c, key) if key else None
         if row is not None:
             return row, False
-        admit_upload(c, context.settings, context.objects, length, captures=1)
+        admit_upload(c, context.settings, context.objects, NewData(captures=1, size=length))
         upload = new_id()
         uploads.add(c, upload, length, metadata, context.settings.upload_seconds, key or None)
         return uploads.get(c, upload), True

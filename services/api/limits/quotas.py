@@ -35,6 +35,25 @@ class Limit:
     description: str
 
 
+@dataclass(frozen=True)
+class NewData:
+    """What a request is about to add.
+
+    Attributes
+    ----------
+    captures, jobs : int
+    size : int
+        Bytes that it keeps; with 0, the limits must still not be exceeded already.
+    room : int
+        Bytes that the disk must have in addition, while it is at work.
+    """
+
+    captures: int = 0
+    jobs: int = 0
+    size: int = 0
+    room: int = 0
+
+
 UNITS: dict[str, Unit] = {
     "upload_bytes": "bytes",
     "unpacked_bytes": "bytes",
@@ -84,8 +103,8 @@ def admit(
 
     Parameters
     ----------
-    size : int
-        Bytes; with 0, the limits must still not be exceeded already.
+    captures, jobs, size : int
+        As of `NewData`.
 
     Raises
     ------
@@ -94,37 +113,23 @@ def admit(
     TooMany
         If the owner must wait first.
     """
-    _admit_owner(connection, settings, captures, jobs, size)
+    _admit_owner(connection, settings, NewData(captures, jobs, size))
     # What others have only promised to send is of no account here, see `admit_upload`.
     if (room := _room_of_service(connection, settings)) is not None:
         _check_service(settings, size, size - room)
 
 
-def admit_upload(
-    connection: Connection,
-    settings: Settings,
-    objects: Objects,
-    size: int,
-    *,
-    room: int = 0,
-    captures: int = 0,
-    jobs: int = 0,
-) -> None:
+def admit_upload(connection: Connection, settings: Settings, objects: Objects, wanted: NewData) -> None:
     """Check the same before something is uploaded, and that the disk has room for its bytes.
 
     Room that other owners were promised for uploads is kept for them, but never more than half of what there is: so
     nobody can lock out the others by promises. What is promised twice is refused when its bytes come.
 
-    Parameters
-    ----------
-    room : int
-        Bytes that the disk must have in addition.
-
     Raises
     ------
     NoRoom, TooMany
     """
-    _admit_owner(connection, settings, captures, jobs, size)
+    _admit_owner(connection, settings, wanted)
     own = statistics.promised_bytes(connection)
     others = statistics.promised_bytes(connection, all_owners=True) - own
 
@@ -132,11 +137,12 @@ def admit_upload(
         return size + own + min(others, max(free, 0) // 2) - free
 
     if (free := _room_of_service(connection, settings)) is not None:
-        _check_service(settings, size, lacking(free, size))
-    if (free := _room_on_disk(connection, objects)) is not None and lacking(free, size + room) > 0:
-        missing = lacking(free, size + room)
+        _check_service(settings, wanted.size, lacking(free, wanted.size))
+    most = wanted.size + wanted.room
+    if (free := _room_on_disk(connection, objects)) is not None and lacking(free, most) > 0:
+        missing = lacking(free, most)
         raise NoRoom(
-            f"the store has no room for {size + room} bytes. Delete captures, mattes or uploads, or free {missing} "
+            f"the store has no room for {most} bytes. Delete captures, mattes or uploads, or free {missing} "
             "bytes on the disk",
             missing=missing,
         )
@@ -155,10 +161,10 @@ def admit_bytes(connection: Connection, settings: Settings, objects: Objects) ->
         raise NoRoom(NEARLY_FULL, missing=-free)
 
 
-def _admit_owner(connection: Connection, settings: Settings, captures: int, jobs: int, size: int) -> None:
+def _admit_owner(connection: Connection, settings: Settings, wanted: NewData) -> None:
     """Check the limits of an owner, and that the database has room for rows."""
-    if captures and settings.owner_captures is not None:
-        value = statistics.captures_and_uploads(connection) + captures
+    if wanted.captures and settings.owner_captures is not None:
+        value = statistics.captures_and_uploads(connection) + wanted.captures
         if value > settings.owner_captures:
             raise NoRoom(
                 f"you may have {settings.owner_captures} captures, unfinished uploads included, and this would be "
@@ -167,8 +173,8 @@ def _admit_owner(connection: Connection, settings: Settings, captures: int, jobs
                 limit=settings.owner_captures,
                 value=value,
             )
-    if jobs and settings.owner_jobs is not None:
-        value = statistics.active_jobs(connection) + jobs
+    if wanted.jobs and settings.owner_jobs is not None:
+        value = statistics.active_jobs(connection) + wanted.jobs
         if value > settings.owner_jobs:
             raise TooMany(
                 f"you may have {settings.owner_jobs} queued or running jobs, ingests included, and this would be "
@@ -178,7 +184,7 @@ def _admit_owner(connection: Connection, settings: Settings, captures: int, jobs
                 value=value,
             )
     if settings.owner_bytes is not None:
-        value = statistics.stored_bytes(connection) + size
+        value = statistics.stored_bytes(connection) + wanted.size
         if value > settings.owner_bytes:
             missing = value - settings.owner_bytes
             raise NoRoom(

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 import anyio.to_thread
 
 from services.api.context import Context
-from services.api.limits.quotas import admit_bytes, admit_upload
+from services.api.limits.quotas import NewData, admit_bytes, admit_upload
 from storage.database.engine import reading, writing
 from storage.errors import NEARLY_FULL, Conflict, NoRoom, Unavailable
 from storage.objects import marker
@@ -130,13 +130,9 @@ async def _next(pieces: AsyncIterator[bytes]) -> bytes | None:
 async def reserved(
     context: Context,
     id: str,
-    size: int,
+    wanted: NewData,
     limit: int,
-    *,
     remove: Callable[[], object] | None = None,
-    room: int = 0,
-    captures: int = 0,
-    jobs: int = 0,
 ) -> AsyncIterator[Reservation]:
     """Reserve room for the body of a request, until the block ends.
 
@@ -144,16 +140,12 @@ async def reserved(
     ----------
     id : str
         Of what the body becomes. The transaction that adds it releases the reservation, so that its bytes count once.
-    size : int
-        Bytes that the request announces, 0 if it announces none.
+    wanted : NewData
+        Its size is that which the request announces, 0 if it announces none.
     limit : int
         Most bytes that it may have.
     remove : callable, optional
         Removes what the block has stored, if it fails.
-    room : int
-        Bytes that the disk must have in addition.
-    captures, jobs : int
-        As of `services.api.limits.quotas.admit`.
 
     Raises
     ------
@@ -162,11 +154,12 @@ async def reserved(
 
     def reserve() -> None:
         with writing(context.engine) as c:
-            admit_upload(c, context.settings, context.objects, size, room=room, captures=captures, jobs=jobs)
-            bodies.add(c, id, min(size, STEP), size)
+            admit_upload(c, context.settings, context.objects, wanted)
+            bodies.add(c, id, min(wanted.size, STEP), wanted.size)
 
     await context.call(reserve)
-    reservation = Reservation(context, id, min(size, STEP), size or limit, check_every=bodies.RENEW)
+    first, most = min(wanted.size, STEP), wanted.size or limit
+    reservation = Reservation(context, id, first, most, check_every=bodies.RENEW)
     try:
         yield reservation
     except Unavailable:  # its row may be there; a sweep removes what has none

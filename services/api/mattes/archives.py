@@ -17,7 +17,7 @@ from services.api.http.idempotency import IdempotencyKey, find_earlier, idempote
 from services.api.http.media_types import ZIP, require_media_type
 from services.api.http.responses import bytes_response
 from services.api.http.router import Router
-from services.api.limits.quotas import admit
+from services.api.limits.quotas import NewData, admit
 from services.api.limits.reservations import reserved
 from services.api.mattes.mattes import Matte, save_as, title_of
 from services.runtime.problems import Unauthorized
@@ -142,7 +142,8 @@ async def _from_body(context: Context, request: Request, name: str, key: str | N
         return earlier
     matte = new_id()
     # The disk has to hold the archive, and the matte.
-    async with reserved(context, matte, length, context.settings.upload_bytes, room=length) as reservation:
+    wanted = NewData(size=length, room=length)
+    async with reserved(context, matte, wanted, context.settings.upload_bytes) as reservation:
         try:
             part = await store_as_upload(reservation.watch(limit.stream(request)), context.objects, matte)
             row = await context.compute(

@@ -17,7 +17,7 @@ from services.api.http.idempotency import find_earlier, idempotent
 from services.api.http.media_types import JSON, media_type_of
 from services.api.http.router import Router
 from services.api.jobs.job import Job
-from services.api.limits.quotas import admit
+from services.api.limits.quotas import NewData, admit
 from services.api.limits.reservations import reserved
 from services.runtime import tracing
 from services.runtime.problems import BadRange, problem_of
@@ -78,7 +78,7 @@ async def composite_clip(
         await context.call(_require_ready, context, matte)
         id, most = new_id(), context.settings.upload_bytes
         remove = partial(context.objects.delete, composites.path(id))
-        async with reserved(context, id, length, most, remove=remove, jobs=1) as reservation:
+        async with reserved(context, id, NewData(jobs=1, size=length), most, remove) as reservation:
             pieces = reservation.watch(limit.stream(request))
             size = await store_body(pieces, context.objects, composites.clip_path(id))
             job = await context.call(_queue, context, id, matte, options, key, size, webhook)

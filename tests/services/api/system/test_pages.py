@@ -52,7 +52,7 @@ def test_files_are_compressed_for_who_accepts_it(http: TestClient, accepted: str
         assert (again.status_code, again.headers["etag"]) == (304, answer.headers["etag"])
 
 
-def test_changed_file_is_sent_anew(tmp_path: Path) -> None:
+def test_changed_file_is_sent_again(tmp_path: Path) -> None:
     path = tmp_path / "one.js"
     path.write_text("export const one = 1;\n")
     first = minified.minified_file(path, 1.0)
