@@ -183,6 +183,10 @@ class Rest:
         )
         return fit_shares(parts[self.known], self.from_plain[self.known], weight[self.known])
 
+    def size(self) -> float:
+        """The median of the residuals' magnitudes, in units of T: few pixels, as at edges, have most of the squares."""
+        return float(np.median(np.abs(self.rest[self.known])))
+
     def pattern_error(self) -> float:
         """Root mean square of the residuals, in camera units."""
         return float(np.sqrt(np.mean((self.rest[self.known] * self.rho[self.known] / 2) ** 2)))
