@@ -20,7 +20,6 @@ from services.api.mattes.live_page import PAGE, bundle
 from tests.browser.pages import EXPECTED, PHONE, SIZE, is_fitting
 from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import Service, png
-from tests.parts.waiting import until
 from workflows.simulation import glass_ball
 
 pytestmark = pytest.mark.slow
@@ -71,12 +70,17 @@ def glass(browser: Browser, saved: Path) -> Iterator[Page]:
         yield page
 
 
-def drawn(page: Page) -> NDArray[np.float64]:
-    """What the page shows once all of its pixels are drawn, (rows, columns, 3)."""
-    page.wait_for_timeout(600)
-    url = page.locator("canvas").evaluate("(canvas) => canvas.toDataURL('image/png')")
-    data = base64.b64decode(url.partition(",")[2])
-    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), float)
+def drawn(page: Page, since: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """What the page shows once nothing changes any more, (rows, columns, 3); another picture than ``since``."""
+    last = None
+    while True:
+        page.wait_for_timeout(200)
+        url = page.locator("canvas").evaluate("(canvas) => canvas.toDataURL('image/png')")
+        data = base64.b64decode(url.partition(",")[2])
+        before, last = last, np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), float)
+        is_new = since is None or not np.array_equal(last, since)
+        if is_new and before is not None and np.array_equal(last, before):
+            return last
 
 
 def psnr(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
@@ -100,7 +104,7 @@ def test_saved_page_draws_what_the_service_composites(
     before = drawn(glass)
     drop(glass, "beach.png", "image/png", beach)
     expect(glass.locator("#choices input:checked")).to_have_count(0)
-    found = drawn(glass)
+    found = drawn(glass, since=before)
     assert psnr(found, before) < 20  # another backdrop
     bare = Image.open(io.BytesIO(beach)).resize(SIZE)
     assert psnr(found, np.asarray(bare, float)) < 25  # and glass before it
@@ -109,8 +113,9 @@ def test_saved_page_draws_what_the_service_composites(
 
 def test_drag_keys_and_wheel_move_the_backdrop(glass: Page, service: Service, ready: tuple[str, str]) -> None:
     beach = png(glass_ball.backdrop(640, 480), "srgb", np.uint8)
+    before = drawn(glass)
     drop(glass, "beach.png", "image/png", beach)
-    at_rest = drawn(glass)
+    at_rest = drawn(glass, since=before)
     box = glass.locator("#stage").bounding_box()
     assert box
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -118,16 +123,17 @@ def test_drag_keys_and_wheel_move_the_backdrop(glass: Page, service: Service, re
     glass.mouse.down()
     glass.mouse.move(middle[0] + 0.2 * box["width"], middle[1], steps=5)
     glass.mouse.up()
-    dragged = drawn(glass)
+    dragged = drawn(glass, since=at_rest)
     assert psnr(dragged, at_rest) < 25
     assert psnr(dragged, composite(service, ready[1], beach, right=0.2)) > 30
     glass.keyboard.press("]")  # the stage has the focus
-    turned = drawn(glass)
+    turned = drawn(glass, since=dragged)
     assert psnr(turned, composite(service, ready[1], beach, right=0.2, angle=2)) > 30
     glass.mouse.wheel(0, -500)
-    assert psnr(drawn(glass), turned) < 35
+    enlarged = drawn(glass, since=turned)
+    assert psnr(enlarged, turned) < 35
     glass.get_by_role("button", name="Reset").click()
-    assert psnr(drawn(glass), at_rest) > 60
+    assert psnr(drawn(glass, since=enlarged), at_rest) > 60
 
 
 @pytest.mark.exhaustive
@@ -137,8 +143,9 @@ def test_built_in_backdrops_differ(glass: Page) -> None:
     before = drawn(glass)
     for radio in radios[1:]:
         radio.check()
-        until(lambda before=before: psnr(drawn(glass), before) < 25)
-        before = drawn(glass)
+        after = drawn(glass, since=before)
+        assert psnr(after, before) < 25
+        before = after
 
 
 def test_file_that_is_no_picture_is_explained(glass: Page) -> None:

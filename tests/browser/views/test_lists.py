@@ -176,6 +176,7 @@ def test_search_wins_over_older_entries_that_come_late(
     desk.goto(f"{service.url}/#/captures")
     entries = desk.get_by_role("main").locator("ul.list > li")
     desk.get_by_role("button", name="Show older").click()
+    until(lambda: held or desk.wait_for_timeout(50))
     desk.get_by_role("searchbox", name="Search").fill("glass 11")
     desk.wait_for_timeout(500)
     held[0].fallback()

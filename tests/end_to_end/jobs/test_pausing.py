@@ -16,7 +16,8 @@ def test_paused_job_does_nothing_until_it_is_continued(service: Service, capture
     found = service.client.pause(job)
     assert found.answer["paused"] is True
     assert found.waits_for == "it is paused, and does what is left once it is continued"
-    time.sleep(2)  # for the tiles that were under way, and to write what is done
+    time.sleep(2)  # for what the service knows of the cluster, and to write what is done
+    until(lambda: service.http.get("/v1/cluster").json()["queue"]["tiles_under_way"] == 0)
     rest = service.client.job(job)
     assert rest.tiles["total"] == 0 or rest.tiles["done"] < rest.tiles["total"]
     time.sleep(4)  # in which all tiles would be done
