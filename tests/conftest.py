@@ -22,7 +22,9 @@ EXHAUSTIVE = 3
 """Value of ``--times`` from which on exhaustive tests run too."""
 SERVED = ("end_to_end", "browser")
 """Folders whose tests share a service."""
-KERNELS = pytest.StashKey["subprocess.Popen[bytes]"]()
+KERNELS = pytest.StashKey["tuple[subprocess.Popen[bytes], str]"]()
+COMPILED = "kernels/compiled"
+"""Where pytest's cache keeps of which version all kernels are compiled."""
 __all__ = ["postgresql", "postgresql_server", "s3", "s3_server"]
 
 
@@ -54,14 +56,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def version_of_kernels() -> str:
+    """When a source of the kernels changed last, and which Python compiles them."""
+    changed = max(path.stat().st_mtime for path in (Path(__file__).parents[1] / "workflows").rglob("*.py"))
+    return f"{changed} {sys.version}"
+
+
 def pytest_xdist_setupnodes(config: pytest.Config) -> None:
     """Compile the kernels beside the first tests: in a fresh tree each process would compile them for itself."""
-    config.stash[KERNELS] = subprocess.Popen(
+    version = version_of_kernels()
+    if config.cache.get(COMPILED, None) == version:
+        return
+    warm = subprocess.Popen(
         [sys.executable, "-m", "services", "warm"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
+    config.stash[KERNELS] = warm, version
 
 
 class OneService(LoadFileScheduling):
@@ -80,8 +92,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> OneServ
 def pytest_unconfigure(config: pytest.Config) -> None:
     """Interrupt what still compiles, with the processes it has started, so that nothing is left of it."""
     if KERNELS in config.stash:
-        os.killpg(config.stash[KERNELS].pid, signal.SIGINT)
-        config.stash[KERNELS].wait()
+        warm, version = config.stash[KERNELS]
+        if warm.poll() is None:
+            os.killpg(warm.pid, signal.SIGINT)
+        if warm.wait() == 0:
+            config.cache.set(COMPILED, version)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
