@@ -117,6 +117,7 @@ def test_list_comes_back_by_itself_after_an_outage(
     expect(entry).to_be_visible()
     expect(desk.get_by_role("main").get_by_role("alert")).to_have_count(0)
     desk.unroute("**/thumbnail.png")
+    entry.scroll_into_view_if_needed()  # captures of other tests may be above it
     expect(entry.locator("img")).to_be_visible()
 
 
