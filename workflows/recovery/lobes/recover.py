@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.fitting.averages import KEPT, adjacent, average_fits
+from workflows.recovery.lobes.fitting.channels import disputed, share_of_separate
 from workflows.recovery.lobes.fitting.fits import Fits, Pixels, make_buffers
 from workflows.recovery.lobes.fitting.neighbours import coarse_to_fine
 from workflows.recovery.lobes.fitting.pixels import fit_pixels
@@ -188,15 +189,19 @@ def _recover_measured(
     pixels = Pixels(patterns.pyramid.arrays, patterns.code, joint, own, strays)
     fits = Fits.of(n, options.most_lobes, len(strays))
     fit_pixels(pixels, alive, *coarse_to_fine(places, n), separate, options, fits)
+    share = separate.astype(np.float64)
     if places is not None:
-        averages = Fits.of(n, options.most_lobes * KEPT, len(strays))
-        average_fits(pixels, adjacent(places), separate, fits, averages)
+        averages, near = Fits.of(n, options.most_lobes * KEPT, len(strays)), adjacent(places)
+        both = disputed(separate, near) if patterns.channels == 3 else np.zeros(n, bool)
+        average_fits(pixels, near, separate, both, fits, averages)
+        if both.any():
+            share = share_of_separate(pixels, near, separate, both, fits, averages, options)
         fits = averages
-    shared, parts = alive & ~separate, []
+    shared, parts = alive & (share == 0), []
     buffers = make_buffers(fits.level.shape[2], joint.value.shape[1], patterns.pyramid.nodes)
     for first in range(0, max(n, 1), _BLOCK):
         last = min(first + _BLOCK, n)
-        node, weight = finish_pixels(pixels, first, last, separate, fits, options, buffers, found)
+        node, weight = finish_pixels(pixels, first, last, share, fits, options, buffers, found)
         parts.append(
             Transport.from_rows(
                 columns,

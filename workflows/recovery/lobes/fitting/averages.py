@@ -2,8 +2,8 @@
 
 Several sets of lobes explain the measurements of a pixel about as well, the more so the fewer patterns there are, and
 the best of them has fitted their noise too. Bayesian model averaging (Hoeting et al., Statistical Science, 1999) takes
-the mean of T over all of them, each with its share of the likelihood. The fits of the pixels about it, and of its other
-channels, are such sets, found from other measurements.
+the mean of T over all of them, each with its share of the likelihood. The fits of the pixels about it, of its other
+channels, and of all channels with their lobes apart, are such sets, found from other measurements.
 """
 
 import math
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from workflows.recovery.lobes.fitting.fits import (
     ALL,
+    DISPERSED,
     Fits,
     Pixels,
     fit_of,
@@ -27,13 +28,16 @@ from workflows.recovery.lobes.mixture import (
     Workspace,
     copy_mixture,
     make_workspace,
+    move,
     predict,
     without_derivatives,
 )
 
-KEPT = 4
+KEPT = 8
 """Fits that are averaged, at most: the likeliest."""
 
+# Of this many measurements, half as many fits: the others gain little there, and take time.
+_MANY = 100
 # Rows and columns from a pixel to the eight about it.
 _OFFSETS = np.array([(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right])
 # Another fit may leave -2 ln likelihood higher by this for each parameter: its own noise is not fitted.
@@ -127,6 +131,21 @@ def _dispersion(fits: Fits, p: int, c: int, other: int, near: NDArray[np.int64])
 
 
 @njit(nogil=True, cache=True)
+def _other_fit(e: int, c: int, about: int) -> tuple[int, int]:
+    """Another fit that may explain fit c of a pixel: which of the pixels about it, 0 for itself, and of which channels.
+
+    First come the ``about`` ones of c, then those of the other channels and of all, then those with lobes apart.
+    """
+    if e < about:
+        return e, c
+    if e < about + 2:
+        return 0, (c + 1 + e - about) % 3
+    if e == about + 2:
+        return 0, ALL
+    return e - about - 3, DISPERSED
+
+
+@njit(nogil=True, cache=True)
 def _average(
     pixels: Pixels,
     p: int,
@@ -140,33 +159,38 @@ def _average(
     patterns, y, variance = measurements_of(pixels, p, c)
     (x_down, y_down), (x_right, y_right) = _slope(fits, p, c, near, 0), _slope(fits, p, c, near, 1)
     about = near.size + 1  # with the pixel itself
-    most, n = fits.level.shape[2], about if c == ALL else about + 2
+    most, n = fits.level.shape[2], about if c == ALL else 2 * about + 3
     count, objective = np.zeros(n, np.int64), np.full(n, np.inf)
     lobes, level = np.empty((n, most, PARAMETERS)), np.empty((n, most), np.int64)
     f, precision = np.empty_like(y), np.empty_like(y)
     response, together = np.empty((most, 1, y.size), np.float32), np.zeros(2)
     for e in range(n):
-        q = near[e - 1] if 0 < e < about else p
-        d = c if e < about else (c + 1 + e - about) % 3
+        i, d = _other_fit(e, c, about)
+        q = near[i - 1] if i > 0 else p
         if q < 0 or fits.k[q, d] == 0:
             continue
         k = fits.k[q, d]
         tried = Mixture(lobes[e], level[e], fits.stray[p, c], together)
         copy_mixture(k, np.int64(0), fit_of(fits, q, d), tried)
-        if e >= about:
-            across, along = _dispersion(fits, p, c, d, near)
-        elif e > 0:
-            down, right = _OFFSETS[e - 1]
+        across, along = 0.0, 0.0
+        if i > 0:
+            down, right = _OFFSETS[i - 1]
             across, along = -down * x_down - right * x_right, -down * y_down - right * y_right
-        else:
-            across, along = 0.0, 0.0
+        elif d != c and d != DISPERSED:
+            across, along = _dispersion(fits, p, c, d, near)
+        if d == DISPERSED:
+            for j in range(k):
+                move(lobes[e, j], tried.dispersion, c)
+            tried.dispersion[:] = 0
         lobes[e, :k, 1] += across
         lobes[e, :k, 2] += along
         predict(patterns, tried, k, without_derivatives(workspace), response, f)
         _, explained = weigh(y, f, variance, patterns.groups, PARAMETERS * k, precision)
-        allowed = _ALLOWED * PARAMETERS * k if e > 0 else 0.0
+        # Fits of the same measurements have fitted their noise, those of all channels too.
+        has_others = i > 0 or (d != c and d < ALL)
+        allowed = _ALLOWED * PARAMETERS * k if has_others else 0.0
         count[e], objective[e] = k, explained + penalty(patterns.grids, tried.level, k) - allowed
-    best = np.argsort(objective)[:KEPT]
+    best = np.argsort(objective)[: KEPT if y.size < _MANY else KEPT // 2]
     share = np.exp((objective[best[0]] - objective[best]) / (2 * _TEMPERATURE))
     share[share < _LEAST_SHARE * share.sum()] = 0
     share /= share.sum()
@@ -187,6 +211,7 @@ def average_fits(
     pixels: Pixels,
     near: NDArray[np.int64],
     separate: NDArray[np.bool_],
+    open_to_both: NDArray[np.bool_],
     fits: Fits,
     averages: Fits,
 ) -> None:
@@ -199,12 +224,14 @@ def average_fits(
         As from :func:`adjacent`.
     separate : (n,) bool
         Whether each channel has its own T.
+    open_to_both : (n,) bool
+        Pixels whose fits are averaged for one T of all channels and for one of each.
     fits : Fits
     averages : Fits
         With room for `KEPT` times as many lobes. Lobes, levels, stray light and numbers of lobes are written.
     """
     workspace = make_workspace(pixels.joint.value.shape[1])
     for p in range(separate.size):
-        for c in fits_of_transport(separate[p]):
+        for c in range(ALL + 1) if open_to_both[p] else fits_of_transport(separate[p]):
             if fits.k[p, c] > 0:
                 _average(pixels, p, c, near[p], fits, averages, workspace)
