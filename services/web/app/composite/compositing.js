@@ -17,11 +17,11 @@ export function compositing(matte, others, signal) {
 	const given = Object.fromEntries(new URLSearchParams(location.hash.split("?")[1]));
 	const controls = placementControls(() => stage.moved(), given);
 	const stage = new Stage(matte, controls.values, signal);
+	const explained = explanation(stage, matte, signal); // before the keys that move the backdrop: it keeps some to itself
 	handleGestures(stage.element, controls, stage);
 	const around = aroundControl(stage, given.around !== "nothing");
 	keepInUrl(stage, controls, matte, signal);
 
-	const explained = explanation(stage, matte, signal);
 	const video = clipJob(matte, () => ({ ...controls.values, around: stage.around ? "backdrop" : "nothing", fit: "frame" }), signal);
 	const taken = downloads(stage, matte, signal);
 	const play = playButton(stage);
