@@ -141,8 +141,8 @@ def _other_fit(e: int, c: int, about: int) -> tuple[int, int]:
     if e < about + 2:
         return 0, (c + 1 + e - about) % 3
     if e == about + 2:
-        return 0, ALL
-    return e - about - 3, DISPERSED
+        return 0, int(ALL)
+    return e - about - 3, int(DISPERSED)
 
 
 @njit(nogil=True, cache=True)
