@@ -77,16 +77,16 @@ def _explain(
         light = lay_out(program, capture.monitor, stack.images(), scaled=stack.attributes["scaled"])
         measured = {name: stack.attributes[name] for name in MEASURED}
         found = find_unexplained(capture, light, wide, at_rest)
-        of_border = _border_light(stack, border)
-        if turn == 1 and of_border is None and found is not None and found.rest.size() > before:
+        if found is None or turn == TONE_MAPPING_TURNS:
+            break
+        of_border, left = _border_light(stack, border), found.rest.size()
+        if of_border is None and left > before:
             # What the patterns don't explain, as of glass with many edges, has only looked like it.
             calibrate(stack, border)
             turn = TONE_MAPPING_TURNS
             continue
-        mapped = None
-        if found is not None and turn < TONE_MAPPING_TURNS:
-            known, before = stack.attributes["tone_mapping"], found.rest.size()
-            mapped = find_tone_mapping(stack, found.rest, wide, known, of_border)
+        before = left
+        mapped = find_tone_mapping(stack, found.rest, wide, stack.attributes["tone_mapping"], of_border)
         if mapped is None:
             break
         calibrate(stack, border, tone_mapping=mapped)
