@@ -230,7 +230,7 @@ def relative_to_white(exposures: Doubles, patterns: Sequence[int], program: Prog
 
 
 def is_free(exposed: Sequence[float] | NDArray[np.float64] | None) -> bool:
-    """Whether the exposure of a film was not locked.
+    """Whether the exposure of a film, or of stills, was not locked.
 
     Then errors of the exposures make more values brighter than white than noise does.
     """
