@@ -222,7 +222,7 @@ def _auto_exposure(exposed: list[float] | None, cost: float, *, filmed: bool) ->
             level=level,
             message=f"the camera's exposure changed by up to {100 * most:.0f} % from pattern to pattern, "
             + ("as the border shows" if filmed else "as its files state")
-            + ": recovery follows it",
+            + ": recovery follows it, and composites are exposed as white was",
             cost=cost or None,
             remedy=""
             if level == "good"

@@ -26,7 +26,7 @@ def quality(expected: Quality | None, random: bool) -> list[Finding]:
     if not random:
         worst, best, why = "backdrops finer than the patterns", "coarser ones", ""
     elif expected.blocks is None:
-        worst, best, why = "frosted glass, dispersion, many edges", "clear glass", ""
+        worst, best, why = "dispersion, many edges", "clear glass", ""
     else:
         worst, best = "clear glass, many edges", "frosted glass"
         why = (

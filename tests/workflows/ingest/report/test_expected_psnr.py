@@ -92,8 +92,13 @@ def test_little_is_expected_of_a_camera_whose_exposure_was_free() -> None:
     assert locked == expect(program, SURVEY, 0.0)
     free = expect(program, SURVEY, 0.0, exposures=np.linspace(0.8, 1.25, 140).tolist())
     assert free is not None
-    assert 18 < free.low < 25
-    assert free.high - free.low == pytest.approx(20 * np.log10(2.9 / 0.5), abs=1)
+    # Shown brighter by three tenths, a backdrop of all levels is as far off as this.
+    assert free.low == pytest.approx(-10 * np.log10((0.3 * SURVEY["contrast"]) ** 2 / 3), abs=0.1)
+    assert 36 < free.high < 42
+    steadier = expect(program, SURVEY, 0.0, exposures=np.linspace(0.88, 1.13, 140).tolist())
+    assert steadier is not None
+    assert steadier.low == free.low
+    assert steadier.high > free.high + 3
 
 
 def test_of_a_program_that_is_not_shown_to_its_end_only_what_was_shown_counts() -> None:
@@ -130,8 +135,13 @@ def test_what_no_t_explains_is_not_promised() -> None:
     ideal, real = (expect(program, SURVEY, error) for error in (0.0, 0.02))
     assert ideal is not None
     assert real is not None
-    assert real.high < -20 * log10(0.02 * SURVEY["contrast"]) < ideal.high
-    assert real.low < ideal.low
+    assert real.low < -20 * log10(0.02 * SURVEY["contrast"]) < ideal.low
+    # At best half of it, and of not more than patterns show.
+    assert real.high == pytest.approx(-10 * log10((0.02 * SURVEY["contrast"]) ** 2 / 2), abs=0.5)
+    shown = expect(program, SURVEY, 0.02, np.hypot(SURVEY["deviation"], 0.01 * SURVEY["contrast"]))
+    assert shown is not None
+    assert shown.low == real.low
+    assert real.high + 2 < shown.high < ideal.high - 2
 
 
 @pytest.mark.parametrize("half_colour", [False, True])
