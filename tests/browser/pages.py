@@ -1,11 +1,14 @@
 """Pages of the app for tests, and what they must not do."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, Route
+
+from tests.parts.waiting import until
 
 ZIP = "Choose a film, stills or a capture archive"
 """The label of the field for capture archives and films."""
@@ -43,6 +46,37 @@ def opened(browser: Browser, **options: Any) -> Iterator[Page]:
     wrong = [text for text in wrong if not any(expected in text for expected in EXPECTED)]
     assert wrong == [], wrong  # with a message: pytest does not rewrite asserts of this file
     assert len(hosts - {""}) == 1  # blob and data URLs have no host
+
+
+def wait(page: Page, condition: Callable[[], object]) -> None:
+    """Wait as `until` does, while what a page asks for reaches the test."""
+    until(lambda: condition() or page.wait_for_timeout(50))
+
+
+class Held:
+    """Requests that a page sends from now on, with any or some methods: they wait until the test answers them."""
+
+    def __init__(self, page: Page, url: str | re.Pattern[str], *methods: str) -> None:
+        self.routes: list[Route] = []
+        self._page = page
+        self._methods = methods
+        page.route(url, self._take)
+
+    def _take(self, route: Route) -> None:
+        if not self._methods or route.request.method in self._methods:
+            self.routes.append(route)
+        else:
+            route.continue_()
+
+    def next(self) -> Route:
+        """The request that has waited longest, as soon as there is one."""
+        wait(self._page, lambda: self.routes)
+        return self.routes.pop(0)
+
+    def release(self) -> None:
+        """Let all go on that wait."""
+        while self.routes:
+            self.routes.pop(0).continue_()
 
 
 def asks_before_closing(page: Page) -> bool:

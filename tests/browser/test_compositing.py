@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
+from playwright.sync_api import Browser, BrowserContext, Page, expect
 
-from tests.browser.pages import PHONE, unfold
+from tests.browser.pages import PHONE, Held, unfold
 from tests.end_to_end.conftest import BANDS, Service, png
 from tests.parts.captures import nested_program
 from tests.parts.waiting import until
@@ -175,16 +175,14 @@ def test_slow_device_draws_fewer_pixels_but_240(context: BrowserContext, service
 def test_live_picture_is_replaced_by_exact_one(context: BrowserContext, service: Service, ball: str) -> None:
     page = opened(context, service, ball)
     expect(page.get_by_text(READY)).to_be_visible(timeout=MINUTE)
-    held: list[Route] = []
-    page.route("**/composite?*", lambda route: held.append(route))
+    held = Held(page, "**/composite?*")
     canvas, image = page.locator(".picture.stage canvas").first, page.locator(".picture.stage img")
     page.get_by_role("group", name="Composite.").press("ArrowRight")
     expect(page.get_by_text("Checker: live")).to_be_visible()
     expect(canvas).to_be_visible()
     expect(image).to_be_hidden()
     page.wait_for_timeout(500)
-    for route in held:
-        route.continue_()
+    held.release()
     page.unroute("**/composite?*")
     expect(page.get_by_text(EXACT)).to_be_visible(timeout=MINUTE)
     expect(image).to_be_visible()

@@ -5,9 +5,9 @@ import socket
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import MINUTE, ZIP
+from tests.browser.pages import MINUTE, ZIP, Held, wait
 from tests.end_to_end.conftest import Service, paused, serving
 
 pytestmark = pytest.mark.slow
@@ -125,12 +125,10 @@ def test_job_is_followed_again_after_sleep(desk: Page, service: Service, ready: 
         desk.goto(f"{service.url}/#/jobs/{job}")
         expect(desk.locator(".stage .badge")).to_have_text("running")
         expect(desk.get_by_label("Progress").get_by_role("term")).not_to_have_count(0)
-        while len(read) < 2:  # the log, for the known state and for the first event
-            desk.wait_for_timeout(100)
+        wait(desk, lambda: len(read) >= 2)  # the log, for the known state and for the first event
         assert requests == [None]
         desk.clock.fast_forward("08:00:00")
-        while len(requests) == 1:
-            desk.wait_for_timeout(100)
+        wait(desk, lambda: len(requests) > 1)
         assert requests[1]  # resumes after the last event received
         expect(desk.locator(".stage .badge")).to_have_text("running")  # though there is no new one
     expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
@@ -235,20 +233,18 @@ def test_count_of_the_activity_is_right_after_an_outage(
 def test_answer_about_the_matte_may_come_after_the_end(
     desk: Page, service: Service, ready: tuple[str, str], leaves: bool
 ) -> None:
-    asked: list[Route] = []
-    desk.route("**/v1/mattes/*", lambda route: asked.append(route))
+    held = Held(desk, "**/v1/mattes/*")
     with paused(service):
         job = service.client.recover(ready[0], quality="fast")["id"]
         desk.goto(f"{service.url}/#/jobs/{job}")
         expect(desk.get_by_role("button", name="Cancel")).to_be_visible()
     expect(desk.get_by_role("link", name="Open the matte")).to_be_visible(timeout=MINUTE)
-    while not asked:
-        desk.wait_for_timeout(50)
+    answer = held.next()
     if leaves:
         desk.get_by_role("link", name="Jobs").first.click()
         expect(desk.get_by_role("heading", name="Jobs")).to_be_visible()
     else:
-        asked[0].fulfill(json={"preview": True})
+        answer.fulfill(json={"preview": True})
         desk.wait_for_timeout(200)
         expect(desk.get_by_role("button", name="Cancel")).to_be_hidden()  # the job is not running again
 

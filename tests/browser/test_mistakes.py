@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.browser.pages import MINUTE, ZIP, asks_before_closing, opened
+from tests.browser.pages import MINUTE, ZIP, Held, asks_before_closing, opened, wait
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.parts.disks import small_disk
 
@@ -28,20 +28,6 @@ def empty_zip() -> bytes:
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("document.xml", "<document/>")
     return file.getvalue()
-
-
-def hold(page: Page) -> list[Route]:
-    """Holds the PATCH requests of uploads that a page sends from now on, until they are continued."""
-    held: list[Route] = []
-
-    def take(route: Route) -> None:
-        if route.request.method == "PATCH":
-            held.append(route)
-        else:
-            route.continue_()
-
-    page.route("**/v1/uploads/*", take)
-    return held
 
 
 def envmatte_keys(data: Path, *arguments: str) -> str:
@@ -107,11 +93,7 @@ def test_interrupted_upload_continues(desk: Page, service: Service, ball: Path) 
 
 
 def test_upload_survives_other_views_and_the_back_button(desk: Page, service: Service, ball: Path) -> None:
-    held: list[Route] = []
-    desk.route(
-        "**/v1/uploads/*",
-        lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_(),
-    )
+    held = Held(desk, "**/v1/uploads/*", "PATCH")
     desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(ball)
     row = desk.get_by_role("region", name="ball.zip")
@@ -121,10 +103,9 @@ def test_upload_survives_other_views_and_the_back_button(desk: Page, service: Se
     desk.go_back()
     expect(row).to_be_visible()
     desk.go_forward()
-    while not held:
-        desk.wait_for_timeout(50)
+    upload = held.next()
     assert asks_before_closing(desk)
-    held.pop().continue_()
+    upload.continue_()
     desk.get_by_role("navigation").get_by_role("link", name="Captures").click()
     expect(desk.get_by_text("a ball", exact=True).first).to_be_visible(timeout=MINUTE)
     expect(row).to_have_count(0, timeout=MINUTE)
@@ -136,23 +117,14 @@ def test_same_file_uploaded_in_two_tabs_is_one_capture(desk: Page, service: Serv
     desk.goto(f"{service.url}/#/captures")
     second = desk.context.new_page()
     second.goto(f"{service.url}/#/captures")
-    held: list[Route] = []
-    second.route(
-        "**/v1/uploads/*",
-        lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_(),
-    )
-    desk.route(
-        "**/v1/uploads/*",
-        lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_(),
-    )
+    uploads = []
     for page in (desk, second):
+        held = Held(page, "**/v1/uploads/*", "PATCH")
         page.get_by_label(ZIP).set_input_files(ball)
-        number = len(held)
-        while len(held) == number:
-            page.wait_for_timeout(50)
+        uploads.append(held.next())
         expect(page.get_by_role("region", name="ball.zip")).to_be_visible()
-    for route in held:
-        route.continue_()
+    for upload in uploads:
+        upload.continue_()
     for page in (desk, second):
         page.unroute("**/v1/uploads/*")
         expect(page).to_have_url(re.compile(r"#/captures/\w+"), timeout=MINUTE)
@@ -215,8 +187,7 @@ def test_job_deleted_by_another_tab_is_not_found(
         desk.reload()
         expect(desk.get_by_text("trying again")).to_be_visible()
         service.http.post(f"/v1/jobs/{job}/cancel")
-        while service.http.delete(f"/v1/jobs/{job}").status_code != 204:
-            desk.wait_for_timeout(100)
+        wait(desk, lambda: service.http.delete(f"/v1/jobs/{job}").status_code == 204)
         desk.unroute(f"**/v1/jobs/{job}/events")
         expect(desk.get_by_role("alert")).to_contain_text("Not found", timeout=MINUTE)
         expect(cancel).to_have_count(0)
@@ -225,21 +196,18 @@ def test_job_deleted_by_another_tab_is_not_found(
 def test_file_removed_during_upload_is_named(desk: Page, service: Service, tmp_path: Path) -> None:
     film = tmp_path / "card.zip"
     film.write_bytes(b"PK\x03\x04" + bytes(9 << 20))  # more than one part
-    held = hold(desk)
+    held = Held(desk, "**/v1/uploads/*", "PATCH")
     desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(film)
-    while not held:
-        desk.wait_for_timeout(50)
+    part = held.next()
     film.rename(tmp_path / "elsewhere")
-    held.pop().continue_()
+    part.continue_()
     expect(desk.get_by_role("alert")).to_contain_text(
         "card.zip was changed, moved or removed", timeout=MINUTE
     )
     (tmp_path / "elsewhere").rename(film)
     desk.get_by_role("button", name="Continue", exact=True).click()
-    while not held:
-        desk.wait_for_timeout(50)
-    assert held[0].request.header_value("upload-offset") == str(8 << 20)
+    assert held.next().request.header_value("upload-offset") == str(8 << 20)
 
 
 @pytest.mark.exhaustive
@@ -255,12 +223,11 @@ def test_wrong_key_then_key_revoked_during_upload(browser: Browser, ball: Path, 
         expect(unknown).to_be_visible()
         key.fill(lab)
         page.keyboard.press("Enter")
-        held = hold(page)
+        held = Held(page, "**/v1/uploads/*", "PATCH")
         page.get_by_label(ZIP).set_input_files(ball)
-        while not held:
-            page.wait_for_timeout(50)
+        upload = held.next()
         envmatte_keys(data, "revoke", "lab")
-        held.pop().continue_()
+        upload.continue_()
         expect(unknown).to_be_visible()
         page.keyboard.press("Escape")
         row = page.get_by_role("region", name="ball.zip")
@@ -335,11 +302,7 @@ def test_service_restarts_with_another_key_during_upload(
 def test_answer_that_comes_late_leaves_the_next_view_alone(
     desk: Page, service: Service, ready: tuple[str, str], action: str
 ) -> None:
-    held: list[Route] = []
-    desk.route(
-        re.compile(r"/v1/\w+(/\w+)?$"),
-        lambda route: route.continue_() if route.request.method == "GET" else held.append(route),
-    )
+    held = Held(desk, re.compile(r"/v1/\w+(/\w+)?$"), "DELETE", "PATCH", "POST")
     desk.goto(f"{service.url}/#/{'film' if action == 'film' else f'captures/{ready[0]}'}")
     if action == "delete":
         desk.get_by_role("button", name="Delete", exact=True).click()
@@ -351,12 +314,11 @@ def test_answer_that_comes_late_leaves_the_next_view_alone(
     else:
         desk.get_by_role("button", name="Rename").click()
         desk.keyboard.press("Enter")
-    while not held:
-        desk.wait_for_timeout(50)
+    change = held.next()
     desk.get_by_role("navigation").get_by_role("link", name="Mattes").click()
     expect(desk).to_have_title("Mattes · envmatte")
-    assert len(held) == 1  # also of a double click
-    held[0].fulfill(json={"id": "made", "name": "a ball"})
+    assert held.routes == []  # also after a double click
+    change.fulfill(json={"id": "made", "name": "a ball"})
     desk.wait_for_timeout(300)
     assert desk.url.endswith("#/mattes")
     assert desk.title() == "Mattes · envmatte"

@@ -4,9 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import MINUTE, PHONE, ZIP, asks_before_closing, opened
+from tests.browser.pages import MINUTE, PHONE, ZIP, Held, asks_before_closing, opened
 from tests.end_to_end.conftest import Service
 from workflows.programs.program import Program
 
@@ -258,19 +258,14 @@ def test_film_is_uploaded_after_a_reload(desk: Page, service: Service) -> None:
 
 def test_another_upload_does_not_end_a_recording(desk: Page, service: Service, ball: Path) -> None:
     filming(desk, service)
-    held: list[Route] = []
-    desk.route(
-        "**/v1/uploads/*",
-        lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_(),
-    )
+    held = Held(desk, "**/v1/uploads/*", "PATCH")
     desk.get_by_role("navigation").get_by_role("link", name="Captures").click()
     desk.get_by_label(ZIP).set_input_files(ball)
     row = desk.get_by_role("region", name="ball.zip")
-    while not held:
-        desk.wait_for_timeout(50)
+    upload = held.next()
     desk.go_back()
     expect(row).to_be_visible()
-    held.pop().continue_()
+    upload.continue_()
     expect(row).to_be_hidden(timeout=MINUTE)
     desk.wait_for_timeout(500)
     expect(desk.get_by_role("button", name="Stop recording")).to_be_visible()
@@ -281,11 +276,10 @@ def test_former_playback_does_not_end_a_recording(desk: Page, service: Service) 
         "/v1/programs", json={"program": SHORT, "monitor": SCREEN, "border": True}
     ).json()
     shown(service, made["id"], "shown")
-    held: list[Route] = []
-    desk.route("**/v1/programs/*/events", lambda route: held.append(route))
+    held = Held(desk, "**/v1/programs/*/events")
     filming(desk, service)
     with desk.expect_response("**/v1/programs/*/events"):
-        held.pop().continue_()
+        held.next().continue_()
     desk.wait_for_timeout(1500)  # longer than recording continues after a program
     expect(desk.get_by_role("button", name="Stop recording")).to_be_visible()
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Page, expect
 
+from tests.browser.pages import wait
 from tests.end_to_end.conftest import Service, serving
 from tests.parts.waiting import until
 from workflows.programs.border import (
@@ -270,7 +271,7 @@ def test_leaving_the_page_stops_the_program(tab: Page, service: Service) -> None
         tab.get_by_role("button", name="full screen").click()
     expect(tab.locator("#countdown")).to_have_text("4")
     tab.goto(f"{service.url}/#/captures")
-    until(lambda: phase(service, program) == "stopped" or tab.wait_for_timeout(50))
+    wait(tab, lambda: phase(service, program) == "stopped")
     countdown = report.value.post_data_json
     assert countdown["phase"] == "countdown"
     late = service.http.put(f"/v1/programs/{program['id']}/showing", json=countdown)

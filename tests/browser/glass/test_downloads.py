@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import SIZE, opened, unfold
+from tests.browser.pages import SIZE, Held, opened, unfold, wait
 from tests.end_to_end.conftest import Service, png
 from workflows.images import float_formats
 from workflows.simulation import glass_ball
@@ -138,22 +138,18 @@ def test_early_drag_is_drawn_as_soon_as_the_browser_can(
     browser: Browser, service: Service, ready: tuple[str, str]
 ) -> None:
     with opened(browser) as page:
-        live: list[Any] = []
-        page.route("**/live", lambda route: live.append(route))
+        live = Held(page, "**/live")
         page.route("**/composite?*size=*", lambda route: None)  # the service never answers
         page.goto(f"{service.url}/#/mattes/{ready[1]}")
         page.get_by_role("group", name="Composite.").press("ArrowRight")
         expect(page.get_by_text("Checker: preview")).to_be_visible()
         page.wait_for_timeout(1000)
-        held: list[Any] = []
-        page.route("**/composite?*", lambda route: held.append(route))
+        held = Held(page, "**/composite?*")
         page.get_by_role("group", name="Composite.").press("ArrowRight")
-        while not held:
-            page.wait_for_timeout(50)
-        live.pop().continue_()
+        wait(page, lambda: held.routes)
+        live.next().continue_()
         expect(page.get_by_text("Checker: live")).to_be_visible()
         expect(page.locator(".picture.stage canvas").first).to_be_visible()
         page.unroute("**/composite?*")
-        for route in held:
-            route.continue_()
+        held.release()
         expect(page.get_by_text(EXACT)).to_be_visible()

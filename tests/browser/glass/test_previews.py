@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.pages import MINUTE
+from tests.browser.pages import MINUTE, wait
 from tests.end_to_end.conftest import Service, paused
 from tests.end_to_end.mattes.test_previews import HEIGHT, WIDTH, upload_large
 from tests.parts.waiting import until
@@ -43,7 +43,7 @@ def test_glass_is_in_the_hand_before_it_is_recovered(desk: Page, service: Servic
         desk.mouse.down()
         desk.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] * 3 / 4, steps=3)
         desk.mouse.up()
-        until(lambda: service.client.job(job["id"]).answer["region"] or desk.wait_for_timeout(50))
+        wait(desk, lambda: service.client.job(job["id"]).answer["region"])
         region = service.client.job(job["id"]).answer["region"]
         expected = {"x": WIDTH / 4, "y": HEIGHT / 2, "width": WIDTH / 4, "height": HEIGHT / 4}
         assert region == pytest.approx(expected, abs=3)

@@ -1,8 +1,9 @@
 """Links to a matte, made and deleted in the app."""
 
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Page, expect
 
+from tests.browser.pages import Held
 from tests.end_to_end.conftest import Service
 from tests.parts.waiting import until
 
@@ -38,15 +39,11 @@ def test_link_is_made_used_and_deleted(
 
 def test_links_that_come_late_or_not_at_first(desk: Page, service: Service, ready: tuple[str, str]) -> None:
     path = f"/v1/mattes/{ready[1]}/links"
-    held: list[Route] = []
-    desk.route(
-        f"**{path}", lambda route: held.append(route) if route.request.method == "GET" else route.continue_()
-    )
+    held = Held(desk, f"**{path}", "GET")
     desk.goto(f"{service.url}/#/mattes/{ready[1]}")
     heading = desk.get_by_role("heading", name="Share")
     heading.click()
-    until(lambda: held or desk.wait_for_timeout(50))
-    held.pop().fulfill(status=500)
+    held.next().fulfill(status=500)
     panel = desk.get_by_role("main").locator("details", has=heading)
     expect(panel.get_by_role("alert")).to_be_visible()
     for _ in range(2):  # closed, and opened again
@@ -54,8 +51,7 @@ def test_links_that_come_late_or_not_at_first(desk: Page, service: Service, read
         desk.wait_for_timeout(200)
     panel.get_by_role("button", name="Make a link").click()
     expect(panel.get_by_role("listitem")).to_have_count(1)
-    until(lambda: held or desk.wait_for_timeout(50))
-    held.pop().continue_()
+    held.next().continue_()
     desk.wait_for_timeout(300)
     expect(panel.get_by_role("listitem")).to_have_count(len(service.http.get(path).json()["links"]))
     # A link is shown only once, so none is made before its address is known.

@@ -11,9 +11,9 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.pages import BY_HAND, MINUTE, PHONE, is_fitting, opened
+from tests.browser.pages import BY_HAND, MINUTE, PHONE, Held, is_fitting, opened
 from tests.browser.test_compositing import WITHOUT
 from tests.end_to_end.conftest import Service
 from tests.parts.waiting import until
@@ -136,14 +136,12 @@ def test_own_picture_is_a_backdrop(desk: Page, service: Service, tmp_path: Path)
 
 @pytest.mark.slow
 def test_picture_stands_in_while_the_glass_is_loading(desk: Page, service: Service) -> None:
-    held: list[Route] = []
-    desk.route(re.compile(r"\.live$"), lambda route: held.append(route))
+    held = Held(desk, re.compile(r"\.live$"))
     desk.goto(service.url)
     still = desk.get_by_alt_text(f"{NAMES[0]} before a checkerboard")
     expect(still).to_be_visible()
     expect(desk.get_by_text("Loading", exact=True)).to_be_visible()
-    for route in held:
-        route.continue_()
+    held.release()
     expect(still).to_be_hidden()
     expect(desk.get_by_text("Loading", exact=True)).to_be_hidden()
     assert settled(desk).any()

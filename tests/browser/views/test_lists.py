@@ -7,6 +7,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from playwright.sync_api import Locator, Page, Route, expect
 
+from tests.browser.pages import Held
 from tests.end_to_end.conftest import Service, paused
 from tests.parts.waiting import until
 
@@ -172,15 +173,14 @@ def test_search_looks_into_all_pages(desk: Page, service: Service, asked: list[d
 def test_search_wins_over_older_entries_that_come_late(
     desk: Page, service: Service, asked: list[dict[str, list[str]]]
 ) -> None:
-    held: list[Route] = []
-    desk.route(re.compile("after="), lambda route: held.append(route))
+    held = Held(desk, re.compile("after="))
     desk.goto(f"{service.url}/#/captures")
     entries = desk.get_by_role("main").locator("ul.list > li")
     desk.get_by_role("button", name="Show older").click()
-    until(lambda: held or desk.wait_for_timeout(50))
+    older = held.next()
     desk.get_by_role("searchbox", name="Search").fill("glass 11")
     desk.wait_for_timeout(500)
-    held[0].fallback()
+    older.fallback()
     desk.wait_for_timeout(500)
     expect(entries).to_have_count(10)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from playwright.sync_api import Page, Route, expect
+from playwright.sync_api import Page, expect
 
-from tests.browser.pages import ZIP, unfold
+from tests.browser.pages import ZIP, Held, unfold
 from tests.end_to_end.conftest import Service
 
 pytestmark = pytest.mark.slow
@@ -91,15 +91,12 @@ def test_what_is_gone_is_explained_without_calls_of_the_api(desk: Page, service:
 
 
 def test_no_picture_is_shown_until_there_is_one(desk: Page, service: Service, ready: tuple[str, str]) -> None:
-    held: list[Route] = []
-    desk.route("**/layers/rho.png", lambda route: held.append(route))
+    held = Held(desk, "**/layers/rho.png")
     desk.goto(f"{service.url}/#/mattes/{ready[1]}")
     unfold(desk)
     image = desk.locator(".layer img")
     expect(image).to_be_hidden()
-    while not held:
-        desk.wait_for_timeout(50)
-    held.pop().continue_()
+    held.next().continue_()
     expect(image).to_be_visible()
 
 
