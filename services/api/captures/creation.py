@@ -141,16 +141,7 @@ def _from_upload(context: Context, given: FromUpload, key: str | None) -> Row[An
             offset=row.offset,
         )
     try:
-        return _register(
-            context,
-            upload,
-            parts,
-            key,
-            name=given.name,
-            webhook=given.webhook,
-            file=file_name(row.metadata),
-            resumable=True,
-        )
+        return _register(context, upload, parts, key, name=given.name, webhook=given.webhook, finished=row)
     except (CaptureError, Corrupt, FileNotFoundError, NotFound) as error:
         is_useless = not isinstance(error, NotFound)  # it would be refused again
         with writing(context.engine) as c:
@@ -181,8 +172,7 @@ def _register(
     *,
     name: str,
     webhook: str | None,
-    file: str = "",
-    resumable: bool = False,
+    finished: Row[Any] | None = None,
 ) -> Row[Any]:
     """Check a complete archive, and add the rows of its capture and of the ingest job.
 
@@ -192,10 +182,10 @@ def _register(
         The id, under which the parts are stored.
     key : str, optional
         The Idempotency-Key.
-    name, file : str
-        The capture has the first name that there is: the one asked for, that in the manifest, or the file's.
-    resumable : bool
-        Whether it was a resumable upload, whose row ends with this.
+    name : str
+        The capture has the first name that there is: this, that in the manifest, or that of an uploaded file.
+    finished : Row, optional
+        The row of a resumable upload, which ends with this.
     """
     context.check_key()
     stored_uploads.seal(context.objects, capture, parts)
@@ -204,17 +194,17 @@ def _register(
     checkpoint()
 
     def create(c: Connection) -> str:
-        if resumable and not uploads.delete(c, capture):
+        if finished is not None and not uploads.delete(c, capture):
             raise NotFound(f"upload {capture} does not exist any more")
         bodies.release(c, capture)
         size = sum(part.size for part in parts)
-        admit(c, context.settings, captures=1, jobs=1, size=size)
+        admit(c, context.settings, NewData(captures=1, jobs=1, size=size))
         job = jobs.add(c, "ingest", capture, {}, trace=tracing.current_traceparent(), webhook=webhook)
         captures.add(
             c,
             capture,
             job,
-            name=name or manifest.name or file,
+            name=name or manifest.name or (file_name(finished.metadata) if finished is not None else ""),
             seconds=context.settings.capture_seconds,
             bytes=size,
             frames=len(manifest.frames) or manifest.program.count,

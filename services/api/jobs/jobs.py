@@ -15,7 +15,7 @@ from services.api.http.responses import json_response
 from services.api.http.router import Router, in_turn
 from services.api.http.types import After, PageSize
 from services.api.jobs.job import Job, Region
-from services.api.limits.quotas import admit
+from services.api.limits.quotas import NewData, admit
 from services.coordinator.job_kinds import JOB_KINDS
 from services.runtime import tracing
 from services.webhooks.sender import check_webhook
@@ -137,7 +137,9 @@ def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
     if earlier is not None:
         return earlier
     with reading(context.engine) as c:
-        admit(c, context.settings, jobs=1)  # again below, where it is certain; to read a program takes longer
+        admit(
+            c, context.settings, NewData(jobs=1)
+        )  # again below, where it is certain; to read a program takes longer
         captures.get(c, request.capture)
         program = captures.program_json(c, request.capture)
     # Grids that do not nest are refused here, not by the job; and before the transaction, for which others wait.
@@ -147,7 +149,7 @@ def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
         capture = captures.get(c, request.capture)
         if capture.state == "failed":
             raise Conflict(f"capture {capture.id} failed: {capture.problem['detail']}")
-        admit(c, context.settings, jobs=1)
+        admit(c, context.settings, NewData(jobs=1))
         matte = new_id()
         chosen = options.model_dump(mode="json")
         job = jobs.add(
@@ -240,7 +242,7 @@ def retry_job(context: OwnerContext, id: str) -> Job:
         # The memory determines the size of an ingest's slabs. If it was too much, new slabs must be smaller.
         memory = (row.plan or {}).get("memory", context.settings.ingest_memory)
         if row.state == "failed":
-            admit(c, context.settings, jobs=1)
+            admit(c, context.settings, NewData(jobs=1))
         jobs.retry(
             c, id, replan=memory != context.settings.ingest_memory, trace=tracing.current_traceparent()
         )

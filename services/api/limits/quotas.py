@@ -54,6 +54,7 @@ class NewData:
     room: int = 0
 
 
+NOTHING = NewData()
 UNITS: dict[str, Unit] = {
     "upload_bytes": "bytes",
     "unpacked_bytes": "bytes",
@@ -96,15 +97,8 @@ def limits_of(connection: Connection, settings: Settings, *, all_owners: bool) -
     ]
 
 
-def admit(
-    connection: Connection, settings: Settings, *, captures: int = 0, jobs: int = 0, size: int = 0
-) -> None:
+def admit(connection: Connection, settings: Settings, wanted: NewData = NOTHING) -> None:
     """Check that an owner may have more. Within the transaction that adds it, the result is certain.
-
-    Parameters
-    ----------
-    captures, jobs, size : int
-        As of `NewData`.
 
     Raises
     ------
@@ -113,10 +107,10 @@ def admit(
     TooMany
         If the owner must wait first.
     """
-    _admit_owner(connection, settings, NewData(captures, jobs, size))
+    _admit_owner(connection, settings, wanted)
     # What others have only promised to send is of no account here, see `admit_upload`.
     if (room := _room_of_service(connection, settings)) is not None:
-        _check_service(settings, size, size - room)
+        _check_service(settings, wanted.size, wanted.size - room)
 
 
 def admit_upload(connection: Connection, settings: Settings, objects: Objects, wanted: NewData) -> None:

@@ -171,7 +171,7 @@ def _import(context: Context, matte: str, part: Part, name: str, key: str | None
 
     def create(c: Connection) -> str:
         bodies.release(c, matte)
-        admit(c, context.settings, size=stored)
+        admit(c, context.settings, NewData(size=stored))
         mattes.add_imported(c, matte, imported.attributes["options"], imported.figures, stored, kept, name)
         return matte
 

@@ -13,7 +13,7 @@ from services.api.http.bodies import json_body, read_json
 from services.api.http.responses import json_response
 from services.api.http.router import Router
 from services.api.http.types import After, PageSize
-from services.api.limits.quotas import admit
+from services.api.limits.quotas import NewData, admit
 from storage.database.engine import reading, writing
 from storage.database.rows import page
 from storage.database.tables import programs as table
@@ -186,7 +186,7 @@ def post_program(
     kept = program_json(program)
     with writing(context.engine) as c:
         if size := programs.added_bytes(c, kept):
-            admit(c, context.settings, size=size)
+            admit(c, context.settings, NewData(size=size))
         id = programs.add(c, kept)
         row = programs.get(c, id)
     response.headers["Location"] = f"/v1/programs/{id}"

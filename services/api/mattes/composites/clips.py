@@ -143,7 +143,7 @@ def _queue(
     def create(c: Connection) -> str:
         row = mattes.get_ready(c, matte)
         bodies.release(c, job)
-        admit(c, context.settings, jobs=1, size=size)
+        admit(c, context.settings, NewData(jobs=1, size=size))
         jobs.add(
             c,
             "composite",
