@@ -52,7 +52,7 @@ def test_exit_code_4_and_no_data_folder_if_the_port_is_taken(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("command", ["serve", "coordinator", "worker", "warm"])
-def test_user_without_a_folder_for_kernels_is_told_to_name_one(
+def test_command_without_a_folder_for_kernels_asks_for_one(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

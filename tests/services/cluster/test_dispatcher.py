@@ -138,7 +138,7 @@ def test_a_missing_scheduler_is_reported_as_a_problem() -> None:
         dispatcher.drop("a")
 
 
-def test_a_cluster_of_its_own_without_workers_is_not_told_to_start_some() -> None:
+def test_only_a_foreign_cluster_without_workers_asks_to_start_some() -> None:
     with (
         LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=None) as empty,
         Dispatcher(lambda: Client(empty, set_as_default=False), "file:///store", lambda tiles: None) as own,

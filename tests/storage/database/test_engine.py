@@ -132,7 +132,7 @@ def test_unreachable_database_is_reported_without_password(url: str) -> None:
         error = error.__cause__
 
 
-def test_user_without_rights_is_told_to_own_the_database(postgresql_server: Server) -> None:
+def test_user_without_rights_learns_who_must_own_the_database(postgresql_server: Server) -> None:
     postgresql_server.execute("CREATE ROLE guest LOGIN")
     with postgresql_server.database() as url:
         with pytest.raises(InvalidInput, match="let its user own the database") as caught:

@@ -208,7 +208,7 @@ def test_missing_object_of_a_bucket_is_no_refusal(s3: str) -> None:
         (errno.ENOENT, FileNotFoundError),
     ],
 )
-def test_errors_of_a_disk_are_told_apart_by_their_number(number: int, kind: type[Exception]) -> None:
+def test_errors_of_a_disk_are_distinguished_by_their_number(number: int, kind: type[Exception]) -> None:
     """As obstore words them: a quota and a disk that may only be read can't be set up here."""
     with pytest.raises(kind), translate_errors():
         raise GenericError(f"Generic LocalFileSystem error: {os.strerror(number)} (os error {number})")

@@ -99,7 +99,7 @@ def test_checks_write_nothing_and_name_what_fails(
     assert "not ready: cluster: DatabaseError" in caplog.text
 
 
-def test_no_more_than_the_code_of_what_a_bucket_answers_is_told(
+def test_problem_of_a_store_has_only_the_code_of_the_answer(
     engine: Engine, s3: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     elsewhere = Objects(s3.replace("envmatte", "another"))

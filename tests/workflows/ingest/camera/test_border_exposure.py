@@ -108,19 +108,19 @@ def test_values_that_see_the_edge_of_the_patterns_hardly_count() -> None:
     assert np.log(found).std() < TRIFLE
 
 
-def test_exposures_are_not_told_by_a_few_edges_of_a_border_of_black_and_white() -> None:
+def test_exposures_ignore_the_few_edges_of_a_border_of_black_and_white() -> None:
     found = BorderValues(Film(np.ones(200), contrasty=True), PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
     assert found is not None
     np.testing.assert_allclose(found, 1, rtol=0.02)
 
 
-def test_exposures_are_not_told_by_what_is_left_of_black_in_a_recorded_screen() -> None:
+def test_exposures_ignore_what_is_left_of_black_in_a_recorded_screen() -> None:
     found = BorderValues(Film(np.ones(200), recorded=True), PROGRAM).exposures(LOOK_UP)  # type: ignore[arg-type]
     assert found is not None
     np.testing.assert_array_equal(found, 1)
 
 
-def test_light_of_the_border_is_told_apart_from_the_veil() -> None:
+def test_light_of_the_border_is_separated_from_the_veil() -> None:
     veil = 0.02 * np.random.default_rng(4).random(PROGRAM.count)
     found = BorderValues(Film(np.ones(PROGRAM.count), veil=veil), PROGRAM).fit(LOOK_UP)  # type: ignore[arg-type]
     assert found is not None

@@ -59,7 +59,7 @@ def test_border_tells_tone_mapping_if_the_exposure_was_locked(
     assert taken == ["light of the border" if asked else None]
 
 
-def test_tone_mapping_is_told_by_pixels_around_the_mask_and_the_rest_by_those_in_it(
+def test_tone_mapping_is_measured_around_the_mask_and_the_rest_in_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stack, tried = measured(masked=True), []

@@ -111,7 +111,7 @@ def test_power_is_that_of_the_residuals() -> None:
 
 @pytest.mark.parametrize("power", [0.0, 0.1])
 @pytest.mark.parametrize("by_colours", [{"mixed": 0.05}, {"smeared": 0.05}])
-def test_what_other_colours_do_is_told_apart(power: float, by_colours: dict[str, float]) -> None:
+def test_effect_of_other_colours_is_separated(power: float, by_colours: dict[str, float]) -> None:
     found = find_tone_mapping(*left_by(power, **by_colours), None)
     assert (found and found["power"]) == (pytest.approx(power, rel=0.1) if power else None)
 
