@@ -17,9 +17,9 @@ from tests.conftest import EXHAUSTIVE
 from tests.end_to_end.conftest import serving
 from tests.faults.conftest import Prepared, check
 from tests.parts.background import repeating
+from tests.parts.processes import alive
 from tests.parts.rig import Row, freeze, stored, thaw
 from tests.parts.waiting import until
-from tests.services.cluster.clusters import running
 
 pytestmark = pytest.mark.timeout(7200)
 
@@ -110,15 +110,15 @@ class Watch:
 
     def look(self) -> Counter[str]:
         """Count the processes in each role."""
-        alive = {}
+        roles = {}
         for process in self.service.children(recursive=True):
             with suppress(psutil.NoSuchProcess):
                 if process.status() != psutil.STATUS_ZOMBIE:
-                    alive[process] = role_of(process)
-        self.seen |= alive.keys()
-        found = Counter(alive.values())
+                    roles[process] = role_of(process)
+        self.seen |= roles.keys()
+        found = Counter(roles.values())
         for process, role, at in self.killed.copy():
-            if process not in alive and found[role] >= self.usual[role]:
+            if process not in roles and found[role] >= self.usual[role]:
                 self.killed.remove((process, role, at))
                 self.seconds.setdefault(role, []).append(time.monotonic() - at)
         return found
@@ -179,7 +179,7 @@ def test_any_process_of_a_service_killed(
     print(f"\nnot needed since: {Counter(role for _, role, _ in watch.killed)}")
     if times >= EXHAUSTIVE:  # a short run may not have the machine to itself
         assert max(max(watch.seconds.get(role, [0])) for role in replaced_soon) < PROMISED
-    until(lambda: not running(list(watch.seen)), 30)
+    until(lambda: not alive(list(watch.seen)), 30)
     assert not list((tmp_path / "data" / "scratch").glob("**/worker-*/"))
     assert objects.names("uploads") == []
     check(table, row)

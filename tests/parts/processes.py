@@ -1,10 +1,12 @@
-"""Commands that run beside a test."""
+"""Commands that run beside a test, and processes that are still there."""
 
 import signal
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
+
+import psutil
 
 
 @contextmanager
@@ -19,6 +21,18 @@ def running(command: Sequence[str], **options: Any) -> Iterator["subprocess.Pope
             yield process
         finally:
             process.kill()
+
+
+def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
+    """Those that have not ended; zombies have."""
+    return [one for one in processes if _is_alive(one)]
+
+
+def _is_alive(one: psutil.Process) -> bool:
+    try:
+        return one.is_running() and one.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:  # it has ended between the two
+        return False
 
 
 def interrupt(process: "subprocess.Popen[str]") -> tuple[int, str]:

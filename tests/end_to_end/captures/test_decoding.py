@@ -18,9 +18,10 @@ from services.decoding.pool import SECONDS
 from tests.end_to_end.conftest import Service, serving
 from tests.end_to_end.mattes.test_composites import SENT, post_composite
 from tests.end_to_end.problems import check_problem
+from tests.parts.processes import alive
 from tests.parts.waiting import until
 from tests.services.api.mattes.archives import archive
-from tests.services.cluster.clusters import children, decoders, running, workers
+from tests.services.cluster.clusters import children, decoders, workers
 from tests.workflows.composite.video.test_steps import clip, even, pictures
 from tests.workflows.ingest.video.camera import capture as filmed
 from tests.workflows.ingest.video.camera import fragmented, overstated, zipped
@@ -38,7 +39,7 @@ def held(service: Service, matte: str) -> Iterator[tuple[psutil.Process, "Future
     idle = decoders(service.process)
     for one in idle:
         one.kill()
-    until(lambda: not running(idle))  # its memory goes first, its sockets last
+    until(lambda: not alive(idle))  # its memory goes first, its sockets last
     assert post_composite(service, matte).status_code == 200
     (one,) = decoders(service.process)
     one.suspend()
@@ -70,7 +71,7 @@ def test_hanging_decoder_is_killed_and_others_keep_serving(service: Service, mat
         problem = check_problem(answer.result(), 422, "bad-image")
         assert meanwhile > 3
         assert "takes more than 20 s" in problem["detail"]
-        until(lambda: not running([one]))
+        until(lambda: not alive([one]))
 
 
 @pytest.mark.parametrize(
@@ -87,7 +88,7 @@ def test_decoders_end_with_the_service(tmp_path: Path, end: str, environment: di
         tree = children(service.process)
         getattr(service.process, end)()
         service.process.wait(120)
-        until(lambda: not running(tree))
+        until(lambda: not alive(tree))
 
 
 def peak_memory(one: psutil.Process) -> int:

@@ -47,7 +47,8 @@ def address(process: subprocess.Popen[str]) -> str:
 
 
 def children(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """All descendants of a process."""
+    """All descendants of a process, which must not have ended."""
+    assert process.poll() is None, f"{process.args} ended with {process.returncode}"
     return psutil.Process(process.pid).children(recursive=True)
 
 
@@ -69,18 +70,6 @@ def _forked(process: subprocess.Popen[str], server: str) -> list[psutil.Process]
             if all(any(server in argument for argument in command) for command in commands):
                 found.append(one)
     return found
-
-
-def running(processes: list[psutil.Process]) -> list[psutil.Process]:
-    """Those that have not ended; zombies have."""
-    return [one for one in processes if _runs(one)]
-
-
-def _runs(one: psutil.Process) -> bool:
-    try:
-        return one.is_running() and one.status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:  # it has ended between the two
-        return False
 
 
 def listening(process: psutil.Process) -> list[tuple[str, int]]:

@@ -20,9 +20,10 @@ from distributed.security import Security
 from services.cluster.connect import connect
 from services.runtime import certificates
 from storage.errors import Unavailable
+from tests.parts.processes import alive
 from tests.parts.waiting import until
 from tests.services.cluster.attempts import answers_without_certificate, gets_in
-from tests.services.cluster.clusters import address, children, listening, running, started, workers
+from tests.services.cluster.clusters import address, children, listening, started, workers
 
 WORKERS = 2
 
@@ -84,7 +85,7 @@ def cluster(folder: Path) -> Iterator[Cluster]:
     at = f"tls://127.0.0.1:{port}"
     (folder / "workers.log").touch()
     with working(folder, at, "--workers", str(WORKERS), "--host", "0.0.0.0") as these:
-        until(lambda: "waiting for the scheduler" in (folder / "workers.log").read_text())
+        until(lambda: "waiting for the scheduler" in (folder / "workers.log").read_text(), by=these)
         with ExitStack() as ending:
             scheduler = ending.enter_context(scheduling(folder, port))
             assert urlsplit(address(scheduler)).port == port
@@ -226,7 +227,7 @@ def test_workers_that_are_stopped_leave_nothing_and_give_back_their_tasks(
         process.send_signal(number)
         assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
         assert not any(tmp_path.iterdir())
-        until(lambda: not running(tree))
+        until(lambda: not alive(tree))
         until(lambda: len(client.nthreads()) == WORKERS)
         assert [task.status for task in busy] == ["pending"] * 2
         client.cancel(busy)
@@ -241,7 +242,7 @@ def test_starting_workers_stop_at_sigterm(cluster: Cluster, tmp_path: Path) -> N
         process.terminate()
         assert process.wait(60) == 0
         assert not any(tmp_path.iterdir())
-        until(lambda: not running(tree))
+        until(lambda: not alive(tree))
 
 
 @pytest.mark.slow
@@ -251,7 +252,7 @@ def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
         tree = children(process)
         assert len(tree) >= 2
         process.kill()
-        until(lambda: not running(tree))
+        until(lambda: not alive(tree))
     until(lambda: len(client.nthreads()) == WORKERS)
 
 
@@ -260,9 +261,8 @@ def test_workers_die_with_their_nanny(cluster: Cluster, client: Client) -> None:
 def test_waiting_workers_stop_at_signals(folder: Path, number: signal.Signals) -> None:
     (folder / "workers.log").write_text("")
     with working(folder, "tls://127.0.0.1:9", "--workers", "2") as process:
-        until(
-            lambda: "waiting for the scheduler at tls://127.0.0.1:9" in (folder / "workers.log").read_text()
-        )
+        log = folder / "workers.log"
+        until(lambda: "waiting for the scheduler at tls://127.0.0.1:9" in log.read_text(), by=process)
         process.send_signal(number)
         assert process.wait(60) == (0 if number == signal.SIGTERM else 130)
 

@@ -73,7 +73,7 @@ def test_the_working_directory_may_be_gone(tmp_path: Path) -> None:
 def test_ctrl_c_while_the_cluster_starts_ends_it_without_tracebacks(tmp_path: Path) -> None:
     options = ["--data", str(tmp_path), "--port", "0", "--workers", "1"]
     with running([sys.executable, "-m", "services", "serve", *options], start_new_session=True) as process:
-        until(lambda: (tmp_path / "scratch").exists())  # the cluster makes it
+        until((tmp_path / "scratch").exists, by=process)  # the cluster makes it
         os.killpg(process.pid, signal.SIGINT)
         _, log = process.communicate(timeout=120)
     assert (process.returncode, "Interrupted." in log, "Traceback" in log) == (130, True, False), log

@@ -17,8 +17,8 @@ from services.decoding.pool import Decoders
 from storage.errors import ImageError, Unavailable
 from tests.parts.inputs.dngs import dng
 from tests.parts.inputs.heics import heic
+from tests.parts.processes import alive
 from tests.parts.waiting import until
-from tests.services.cluster.clusters import running
 from workflows.images import decode, float_formats, integer_formats
 from workflows.untrusted import decoder
 from workflows.untrusted.decoder_process import NAME
@@ -33,7 +33,7 @@ def children() -> list[psutil.Process]:
     for child in psutil.Process().children():
         with contextlib.suppress(psutil.NoSuchProcess):
             found += child.children()
-    return [child for child in running(found) if child.name() == NAME]
+    return [child for child in alive(found) if child.name() == NAME]
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def refusal_by_stopped_child(decoders: Decoders, after: Callable[[psutil.Process
         after(child)
         with pytest.raises(ImageError) as refused:
             left.result()
-    until(lambda: not running([child]))
+    until(lambda: not alive([child]))
     np.testing.assert_array_equal(decoders.decode(PNG, "srgb"), PIXELS)
     return refused.value.detail
 

@@ -7,7 +7,7 @@ import time
 import psutil
 import pytest
 
-from tests.parts.processes import running
+from tests.parts.processes import alive, running
 from tests.parts.waiting import until
 
 START = """
@@ -56,5 +56,5 @@ def test_process_ends_in_time_with_its_children_although_closing_hangs(
         start = time.monotonic()
         process.send_signal(number)
         assert process.wait(60) == 0
-        until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
+        until(lambda: not alive([child]))
         assert time.monotonic() - start < 5

@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from storage.errors import CaptureError, ImageError, Unavailable
+from tests.parts.processes import alive
 from tests.parts.waiting import until
 from tests.workflows.untrusted import taken_over
 from workflows.untrusted import confinement, decoder, decoder_server
@@ -145,7 +146,7 @@ def test_only_bytes_of_the_file_are_given(asked: bytes) -> None:
         list(found.run(taken_over.send, io.BytesIO(framed(asked)[:8])))
 
 
-def test_crash_is_told_as_a_reason_to_try_again() -> None:
+def test_crash_is_reported_as_a_reason_to_try_again() -> None:
     ended = pytest.raises(Unavailable, match=r"film\.mp4 ended .* \(SIGSEGV\)")
     with Decoder(IMAGE) as found, ended, blaming("film.mp4", found):
         list(found.run(taken_over.crash, b""))
@@ -190,7 +191,7 @@ def test_server_that_died_is_replaced(server: Server) -> None:
         list(found.run(taken_over.hoard, b"", size=1))
         (child,) = process_of(server).children()
         process_of(server).kill()
-        until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
+        until(lambda: not alive([child]))
         with pytest.raises(DecoderEnded, match="forked from"):
             list(found.run(taken_over.hoard, b"", size=1))
     with Decoder(IMAGE) as found:
