@@ -52,15 +52,6 @@ def test_bytes_before_a_broken_connection_are_kept(service: Service) -> None:
     service.http.delete(where, headers=TUS)
 
 
-@pytest.mark.exhaustive
-def test_silent_client_is_disconnected(service: Service) -> None:
-    where = create(service, 1000)
-    silent = begin_patch(service, where, 0, 1000, b"a" * 300)
-    until(lambda: offset_of(service, where) == 300)
-    silent.close()
-    service.http.delete(where, headers=TUS)
-
-
 def test_deleted_upload_is_gone(service: Service) -> None:
     before = uploads_of(service)
     where = create(service, 1000)

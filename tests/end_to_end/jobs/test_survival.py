@@ -249,16 +249,6 @@ def test_second_service_on_the_same_folder_is_refused(service: Service) -> None:
     assert service.http.get("/healthz").status_code == 200
 
 
-@pytest.mark.slow
-def test_port_that_is_taken_has_an_exit_code_of_its_own(service: Service, tmp_path: Path) -> None:
-    port = service.url.rpartition(":")[2]
-    command = [sys.executable, "-m", "services", "serve", "--data", str(tmp_path / "data"), "--port", port]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 4
-    assert "choose another port with --port" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 def test_public_address_without_keys_is_refused(tmp_path: Path) -> None:
     command = [
         sys.executable,

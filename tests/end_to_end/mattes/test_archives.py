@@ -130,26 +130,6 @@ def test_false_archive_is_refused_and_leaves_nothing(
     assert elsewhere.stored() == set()
 
 
-@pytest.mark.exhaustive
-def test_archive_over_the_limit_is_refused(archive: Path, tmp_path: Path) -> None:
-    size = archive.stat().st_size
-    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(size - 1)) as small:
-
-        def pieces() -> Iterator[bytes]:
-            yield archive.read_bytes()
-
-        for body in (archive.read_bytes(), pieces()):  # with and without Content-Length
-            answer = small.http.post("/v1/mattes", content=body, headers=ZIP)
-            assert check_problem(answer, 413, "too-large")["limit"] == size - 1
-        with pytest.raises(ServiceError, match=str(size - 1)):
-            small.client.import_matte(archive)
-        assert small.stored() == set()
-    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UNPACKED_BYTES="100000") as small:
-        answer = small.http.post("/v1/mattes", content=archive.read_bytes(), headers=ZIP)
-        assert check_problem(answer, 422, "bad-archive")["limit"] == 100000
-        assert small.stored() == set()
-
-
 @pytest.fixture(scope="module")
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A matte whose archive has 22 MB, more than fits into the buffers of a connection."""

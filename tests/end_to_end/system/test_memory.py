@@ -63,16 +63,3 @@ def test_an_upload_of_a_gigabyte_is_streamed(
         print(f"\n{(peak - idle) / 1e6:.0f} MB above {idle / 1e6:.0f} MB idle")
         assert peak - idle < 200e6
         assert service.client.wait(uploaded["job"])["state"] == "succeeded"
-
-
-@pytest.mark.exhaustive
-def test_upload_over_the_limit_is_not_read(capture_archive: Path, tmp_path: Path) -> None:
-    limit = capture_archive.stat().st_size - 1
-    with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:
-        headers = {"Content-Type": "application/zip"}
-        # The second without Content-Length.
-        for content in (capture_archive.read_bytes(), iter([capture_archive.read_bytes()])):
-            answer = service.http.post("/v1/captures", content=content, headers=headers)
-            assert answer.status_code == 413
-            assert answer.json()["limit"] == limit
-        assert service.stored() == set()

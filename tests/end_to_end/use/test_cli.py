@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 import zipfile
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from PIL import Image
 
 from services.cli.main import main
 from tests.end_to_end.command_line import envmatte
-from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, paused, png
+from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, png
 from tests.parts.processes import interrupt, running
 from workflows.images import integer_formats
 from workflows.programs import presets
@@ -125,50 +124,6 @@ def test_films_and_stills_are_packed_with_their_program(tmp_path: Path) -> None:
     record.write_text(whole)
     os.utime(film, (0, 0))  # before the times that a ZIP can hold
     assert pack(record, film, "-o", archive)[0] == 0
-
-
-def test_refusal_has_exit_code_1(service: Service, tmp_path: Path) -> None:
-    broken = tmp_path / "broken.zip"
-    broken.write_bytes(b"no zip")
-    for arguments, reason in (
-        (["upload", str(broken)], "cut off"),
-        (["recover", "no-such-capture"], "no-such-capture"),
-        (["status", "no-such-job"], "no-such-job"),
-    ):
-        refused = envmatte(service, *arguments)
-        assert (refused.returncode, refused.stdout) == (1, "")
-        assert reason in refused.stderr
-        assert "Traceback" not in refused.stderr
-
-
-def test_wrong_command_line_has_exit_code_2(service: Service, tmp_path: Path) -> None:
-    film = tmp_path / "film.mov"
-    film.write_bytes(b"\0\0\0\x14ftypqt  ")
-    for arguments in (
-        ["list", "jobs", "--name", "glass"],
-        ["export", "m", "-o", "glass.html"],
-        ["upload", str(film)],
-        ["recover"],
-        ["upload", "no-such-file.zip"],
-        ["recover", "x", "--option", "tile"],
-        ["fly"],
-    ):
-        assert envmatte(service, *arguments).returncode == 2
-
-
-@pytest.mark.slow
-def test_interrupt_stops_waiting_but_not_the_job(service: Service, capture: str) -> None:
-    command = [sys.executable, "-m", "services", "recover", capture, "--url", service.url]
-    newest = service.http.get("/v1/jobs?limit=1").json()["jobs"][0]["id"]
-    with paused(service), running(command) as waiting:
-        while (job := service.http.get("/v1/jobs?limit=1").json()["jobs"][0])["id"] == newest:
-            time.sleep(0.01)
-        assert waiting.stderr is not None
-        assert "recovery: 0%" in waiting.stderr.readline()
-        code, stderr = interrupt(waiting)
-    assert code == 130
-    assert "Interrupted" in stderr
-    assert service.client.wait(job["id"])["state"] == "succeeded"
 
 
 def patterns(*arguments: str) -> subprocess.CompletedProcess[str]:

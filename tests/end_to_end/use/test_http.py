@@ -73,15 +73,6 @@ def test_a_recovery_goes_from_queued_to_succeeded(service: Service, capture: str
     assert log == ["queued", "preparing", "recovering", "finishing", "succeeded"]
 
 
-@pytest.mark.slow
-def test_job_posted_during_the_ingest_of_its_capture_succeeds(
-    service: Service, capture_archive: Path
-) -> None:
-    uploaded = service.client.upload(capture_archive)
-    job = service.client.recover(uploaded["id"], quality="fast")
-    assert service.client.wait(job["id"])["state"] == "succeeded"
-
-
 @pytest.mark.parametrize("transfer", ["srgb", "linear"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_a_composite_is_close_to_the_truth(

@@ -125,6 +125,26 @@ def test_exit_code_2_for_a_wrong_command_line(arguments: list[str]) -> None:
     assert "python -m" not in found.stderr
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["list", "jobs", "--name", "glass"],
+        ["export", "m", "-o", "glass.html"],
+        ["upload", "film.mov"],
+        ["recover"],
+        ["recover", "x", "--option", "tile"],
+    ],
+    ids=" ".join,
+)
+def test_arguments_that_fit_no_command_are_refused_before_a_request(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("film.mov").write_bytes(b"\0\0\0\x14ftypqt  ")
+    refused = CliRunner().invoke(main, [*arguments, *UNREACHABLE])
+    assert refused.exit_code == 2, refused.output
+
+
 def test_exit_code_3_if_unreachable_or_busy() -> None:
     found = envmatte("status", "j", "--url", "http://127.0.0.1:9")
     assert (found.returncode, found.stdout) == (3, "")

@@ -49,6 +49,7 @@ def test_exit_code_4_and_no_data_folder_if_the_port_is_taken(tmp_path: Path) -> 
         found = envmatte("serve", "--data", str(data), "--port", str(port))
     assert (found.returncode, found.stdout, data.exists()) == (4, "", False)
     assert "choose another port with --port" in found.stderr
+    assert "Traceback" not in found.stderr
 
 
 @pytest.mark.parametrize("command", ["serve", "coordinator", "worker", "warm"])

@@ -1,11 +1,11 @@
-"""Archives while something else happens: the database restarts, or the matte is deleted."""
+"""Archives of mattes while something else happens, as a restart of the database, and one that is too large."""
 
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import event
+from sqlalchemy import Engine, event
 
 from services.api.app import build_app
 from services.settings import Settings
@@ -77,3 +77,13 @@ def test_download_of_a_matte_that_is_deleted_ends_with_a_line_in_the_log(
     assert (line.levelname, "there is no matte" in line.getMessage()) == ("INFO", True)
     app.state.context.decoders.close()
     engine.dispose()
+
+
+def test_archive_that_unpacks_to_too_much_is_refused_by_the_setting(engine: Engine, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    app = build_app(Settings(data=tmp_path, unpacked_bytes=100_000), engine, Objects(store.as_uri()))
+    with TestClient(app, "http://localhost") as client:
+        answer = client.post("/v1/mattes", content=archive(tmp_path / "other", 64, 64), headers=ZIP)
+    assert (answer.status_code, answer.json()["limit"]) == (422, 100_000)
+    assert [path for path in store.rglob("*") if path.is_file()] == []
+    app.state.context.decoders.close()

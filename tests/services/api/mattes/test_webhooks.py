@@ -1,4 +1,4 @@
-"""Webhooks given in the query, beside a body that is not JSON: the app with a real database and store."""
+"""Webhooks given in a body, or in the query beside one that is not JSON: the app with a real database and store."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,6 +68,8 @@ def test_private_address_is_refused(engine: Engine, archive: bytes, tmp_path: Pa
     ):
         answer = http.post(url, content=body, headers=headers, params=query)
         assert (answer.status_code, answer.json()["field"]) == (422, "webhook")
+    answer = http.post("/v1/jobs", json={"capture": "c"} | query)
+    assert (answer.status_code, answer.json()["field"]) == (422, "webhook")
     assert http.get("/v1/jobs").json() == {"jobs": []}
     assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []
 
