@@ -63,9 +63,9 @@ def moments(T):
     return np.stack([cx, cy, T @ x**2 - cx**2, T @ (x * y) - cx * cy, T @ y**2 - cy**2], axis=-1)
 
 
-def recovered(patterns, scene, options=FINE):
+def recovered(patterns, scene, options=FINE, **given):
     measurements, photometry, noise = scene
-    return lobes.recover(measurements, photometry, patterns, noise, options=options)
+    return lobes.recover(measurements, photometry, patterns, noise, options=options, **given)
 
 
 def part_of(photometry, part):
@@ -167,9 +167,8 @@ def test_channels_that_differ_by_less_than_lobes_miss_get_their_own_t(coloured, 
 
     def bend(x, y):
         around = np.linspace(0, 1.5 * np.pi, 12)
-        return np.mean(
-            [truth((x + 5 * np.cos(a), y + 5 * np.sin(a), 0.5, 0.5))[0, 0] for a in around], axis=0
-        )
+        spots = [truth((x + 5 * np.cos(a), y + 5 * np.sin(a), 0.5, 0.5))[0, 0] for a in around]
+        return np.mean(spots, axis=0)
 
     T = np.stack([[bend(x + 0.5 * c, y) for c in range(3)] for x, y in draws])
     alike = np.repeat(T[:, :1], 3, axis=1)
@@ -257,9 +256,8 @@ def test_rows_are_clean(patterns, varied, observe):
 @pytest.mark.parametrize("least", [0.0, 1e-3])
 def test_least_weight_bounds_the_kept_weights(patterns, truth, observe, least):
     scene = observe(patterns, truth((33.1, 24.8, 12.0, 8.0)))
-    found = recovered(
-        patterns, scene, LobesOptions(least_weight=least, fit_resolution=4.0, resolution=4.0)
-    ).transport
+    options = LobesOptions(least_weight=least, fit_resolution=4.0, resolution=4.0)
+    found = recovered(patterns, scene, options).transport
     assert found.weight.min() >= least
     assert found.weight.min() < max(1.2 * least, 1e-4)
 
@@ -312,9 +310,8 @@ def test_bad_input_gives_finite_rows(spoil, request, colours, varied, observe):
     measurements, photometry, noise = observe(shown, varied)
     measurements, photometry = spoil(measurements, photometry, -1e3)
     for least_contrast in (3.0, 0.0):
-        found = lobes.recover(
-            measurements, photometry, shown, noise, options=LobesOptions(least_contrast=least_contrast)
-        )
+        options = LobesOptions(least_contrast=least_contrast)
+        found = recovered(shown, (measurements, photometry, noise), options)
         assert np.isfinite(found.transport.weight).all()
         sane = [0, 2, 5]
         error = np.abs(dense(shown, found.transport) - varied).sum(axis=2)
@@ -377,23 +374,16 @@ def test_grey_camera_counts_once(patterns, truth, observe):
 
 
 def test_error_of_the_model_is_left_unexplained(patterns, truth, observe):
-    measurements, photometry, noise = observe(
-        patterns, truth(*[(x, 18.6, 1.5, 1.0) for x in range(8, 56, 4)])
-    )
-    wrong = (
-        0.04
-        * photometry.rho[:, np.newaxis]
-        * np.random.default_rng(0).standard_normal(patterns.count)[:, np.newaxis]
-    )
-    seen = (measurements + wrong).astype(np.float32)
     T = truth(*[(x, 18.6, 1.5, 1.0) for x in range(8, 56, 4)])
-    off = [
-        np.abs(
-            dense(patterns, lobes.recover(seen, photometry, patterns, noise, conditions=c).transport) - T
-        ).sum()
-        for c in (lobes.Conditions(model_error=0.04), lobes.Conditions())
-    ]
-    assert off[0] < 0.8 * off[1]
+    measurements, photometry, noise = observe(patterns, T)
+    wrong = 0.04 * np.random.default_rng(0).standard_normal(patterns.count)
+    seen = (measurements + wrong[:, np.newaxis] * photometry.rho[:, np.newaxis]).astype(np.float32)
+
+    def off(conditions):
+        found = recovered(patterns, (seen, photometry, noise), conditions=conditions)
+        return np.abs(dense(patterns, found.transport) - T).sum()
+
+    assert off(lobes.Conditions(model_error=0.04)) < 0.8 * off(lobes.Conditions())
 
 
 def test_shapes_that_do_not_fit_are_refused(patterns, truth, observe):
