@@ -80,16 +80,8 @@ def frame_of_another_size(manifest: dict, files: dict[str, bytes]) -> None:
     files["frames/00009.png"] = integer_formats.encode_png(np.zeros((HEIGHT, WIDTH - 1, 3), np.uint8))
 
 
-def frame_of_another_dtype(manifest: dict, files: dict[str, bytes]) -> None:
-    files["frames/00009.png"] = integer_formats.encode_png(np.zeros((HEIGHT, WIDTH, 3), np.uint16))
-
-
 def frame_that_is_no_image(manifest: dict, files: dict[str, bytes]) -> None:
     files["frames/00009.png"] = b"this is no image"
-
-
-def frame_cut_off(manifest: dict, files: dict[str, bytes]) -> None:
-    files["frames/00009.png"] = files["frames/00009.png"][:1000]
 
 
 def frame_that_is_a_bomb(manifest: dict, files: dict[str, bytes]) -> None:
