@@ -15,17 +15,7 @@ _PLACE = "MATTE: dict[str, Any] = {}\n"
 
 
 def write_blender(matte: Matte, file: IO[bytes], lookups: int, plate: Plate | None = None) -> None:
-    """Write the script.
-
-    Parameters
-    ----------
-    matte : Matte
-    file : IO[bytes]
-    lookups : int
-        Of a pixel, in the EXR that lies beside it.
-    plate : Plate, optional
-        Makes nodes that take a plate of the frame.
-    """
+    """Write the script; parameters are those of `write_nuke`."""
     figures = {
         "name": NAME,
         "size": (matte.width, matte.height),

@@ -18,17 +18,7 @@ SIZE = 2.4
 
 
 def write_nuke_stmap(matte: Matte, file: IO[bytes], lookups: int, plate: Plate | None = None) -> None:
-    """Write the group.
-
-    Parameters
-    ----------
-    matte : Matte
-    file : IO[bytes]
-    lookups : int
-        Of a pixel, in the EXR that lies beside it.
-    plate : Plate, optional
-        Makes nodes that take a plate of the frame.
-    """
+    """Write the group; parameters are those of `write_nuke`."""
     nodes = Nodes()
     backdrop, held = nodes.sources(matte, plate)
     levels = []
