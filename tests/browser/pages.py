@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 
 from playwright.sync_api import Browser, Page, Route
 
+from tests.end_to_end.conftest import Service
 from tests.parts.waiting import until
 
 ZIP = "Choose a film, stills or a capture archive"
@@ -46,6 +47,12 @@ def opened(browser: Browser, **options: Any) -> Iterator[Page]:
     wrong = [text for text in wrong if not any(expected in text for expected in EXPECTED)]
     assert wrong == [], wrong  # with a message: pytest does not rewrite asserts of this file
     assert len(hosts - {""}) == 1  # blob and data URLs have no host
+
+
+def phase_of(service: Service, program: str) -> str | None:
+    """What the page that shows a program has reported last."""
+    showing = service.http.get(f"/v1/programs/{program}").json()["showing"]
+    return showing and str(showing["phase"])
 
 
 def wait(page: Page, condition: Callable[[], object]) -> None:

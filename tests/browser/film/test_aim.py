@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, Page, expect
 from scipy import ndimage
 
 from tests.browser.conftest import ARGUMENTS, WINDOWLESS
-from tests.browser.pages import MINUTE, opened
+from tests.browser.pages import MINUTE, opened, phase_of
 from tests.end_to_end.conftest import Service
 from tests.parts.waiting import until
 from workflows.programs.border import LEAD, Border, draw_border
@@ -126,10 +126,6 @@ def test_program_starts_when_all_is_well(filmed_screen: Browser, service: Servic
     shown = {"preset": "sketch", "monitor": SCREEN, "border": True}
     program = service.http.post("/v1/programs", json=shown).json()["id"]
 
-    def phase() -> str | None:
-        found = service.http.get(f"/v1/programs/{program}").json()["showing"]
-        return found and found["phase"]
-
     with opened(filmed_screen, viewport={"width": 1200, "height": 800}) as page:
         page.goto(f"{service.url}/#/film/{program}")
         expect(page.get_by_role("img", name="The camera on a tripod")).to_be_visible()
@@ -143,7 +139,7 @@ def test_program_starts_when_all_is_well(filmed_screen: Browser, service: Servic
         ):
             expect(found).to_contain_text(text)
         expect(page.get_by_role("meter", name="Exposure")).not_to_have_js_property("value", 0)
-        until(lambda: phase() == "countdown")
+        until(lambda: phase_of(service, program) == "countdown")
         expect(page.get_by_role("button", name="Stop recording")).to_be_visible(timeout=MINUTE)
         expect(found).to_be_hidden()
         page.get_by_role("button", name="Stop recording").click()

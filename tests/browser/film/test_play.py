@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Page, expect
 
-from tests.browser.pages import wait
+from tests.browser.pages import phase_of, wait
 from tests.end_to_end.conftest import Service, serving
 from tests.parts.waiting import until
 from workflows.programs.border import (
@@ -49,11 +49,6 @@ def posted(service: Service, **changes: Any) -> dict[str, Any]:
     assert answer.status_code == 201, answer.text
     found: dict[str, Any] = answer.json()
     return found
-
-
-def phase(service: Service, program: dict[str, Any]) -> str | None:
-    showing = service.http.get(f"/v1/programs/{program['id']}").json()["showing"]
-    return showing and str(showing["phase"])
 
 
 def go(tab: Page, service: Service, program: dict[str, Any]) -> str:
@@ -222,7 +217,7 @@ def test_pictures_are_shown_one_by_one_for_stills(tab: Page, service: Service) -
         elif press:
             tab.keyboard.press(press)
         until(lambda number=number: np.array_equal(canvas(tab), every[number]))
-    assert phase(service, program) is None
+    assert phase_of(service, program["id"]) is None
     tab.keyboard.press("ArrowRight")
     expect(tab.get_by_role("status")).to_contain_text("All 4 pictures were shown")
     expect(tab.get_by_role("button", name="Show for stills")).to_be_focused()
@@ -271,12 +266,12 @@ def test_leaving_the_page_stops_the_program(tab: Page, service: Service) -> None
         tab.get_by_role("button", name="full screen").click()
     expect(tab.locator("#countdown")).to_have_text("4")
     tab.goto(f"{service.url}/#/captures")
-    wait(tab, lambda: phase(service, program) == "stopped")
+    wait(tab, lambda: phase_of(service, program["id"]) == "stopped")
     countdown = report.value.post_data_json
     assert countdown["phase"] == "countdown"
     late = service.http.put(f"/v1/programs/{program['id']}/showing", json=countdown)
     assert late.status_code == 204
-    assert phase(service, program) == "stopped"
+    assert phase_of(service, program["id"]) == "stopped"
 
 
 def test_program_of_another_size_is_fitted_to_this_screen(tab: Page, service: Service) -> None:
@@ -315,10 +310,6 @@ def test_aiming_shows_white_in_the_border_until_a_camera_sees_it(tab: Page, serv
     program = posted(service)
     go(tab, service, program)
 
-    def phase() -> str | None:
-        found = service.http.get(f"/v1/programs/{program['id']}").json()["showing"]
-        return found and str(found["phase"])
-
     def aim() -> None:
         tab.get_by_role("button", name="Aim the camera").click()
         tab.wait_for_function("() => document.getElementById('canvas').width === 640")
@@ -333,10 +324,10 @@ def test_aiming_shows_white_in_the_border_until_a_camera_sees_it(tab: Page, serv
     aim()
     begun = {"phase": "countdown", "patterns_per_second": 2, "seconds": 8}
     assert service.http.put(f"/v1/programs/{program['id']}/showing", json=begun).status_code == 204
-    until(lambda: phase() == "showing")
+    until(lambda: phase_of(service, program["id"]) == "showing")
     tab.keyboard.press("Escape")
-    until(lambda: phase() == "stopped")
+    until(lambda: phase_of(service, program["id"]) == "stopped")
     aim()  # what was reported before starts nothing
     tab.keyboard.press("Space")
-    until(lambda: phase() == "countdown")
+    until(lambda: phase_of(service, program["id"]) == "countdown")
     tab.keyboard.press("Escape")

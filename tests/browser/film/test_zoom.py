@@ -9,8 +9,8 @@ import pytest
 from playwright.sync_api import Page, expect, sync_playwright
 
 from tests.browser.conftest import ARGUMENTS, CHROMIUM
+from tests.browser.pages import phase_of, wait
 from tests.end_to_end.conftest import Service
-from tests.parts.waiting import until
 
 pytestmark = pytest.mark.slow
 
@@ -86,12 +86,7 @@ def test_program_that_a_zoomed_page_would_resample_is_not_started(zoomed: Page, 
     expect(note).to_contain_text("This page is zoomed to 125 %. Set the zoom to 100 % (Ctrl+0")
     expect(note).to_contain_text("made for a screen of 800 × 450 pixels; this screen has 640 × 360")
     expect(stage).to_be_hidden()
-    until(
-        lambda: (
-            (service.http.get(f"/v1/programs/{program}").json()["showing"] or {}).get("phase") == "stopped"
-            or zoomed.wait_for_timeout(50)
-        )
-    )
+    wait(zoomed, lambda: phase_of(service, program) == "stopped")
     start.click()  # the note has been shown: a second start plays
     expect(stage).to_be_visible()
     zoomed.keyboard.press("Escape")

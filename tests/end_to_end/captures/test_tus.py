@@ -203,7 +203,7 @@ def test_invalid_requests_are_refused(service: Service) -> None:
 
 
 @pytest.mark.slow
-def test_upload_limit_is_checked_before_the_first_byte(tmp_path: Path, capture_archive: Path) -> None:
+def test_upload_limit_is_checked_before_the_first_byte(tmp_path: Path) -> None:
     limit = 1 << 58
     with serving(tmp_path / "data", "--workers", "1", ENVMATTE_UPLOAD_BYTES=str(limit)) as service:
         assert service.http.options("/v1/uploads").headers["tus-max-size"] == str(limit)

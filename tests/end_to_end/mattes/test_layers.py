@@ -13,7 +13,6 @@ from PIL import Image
 from services.cli.main import main
 from tests.end_to_end.conftest import HEIGHT, WIDTH, Service
 from workflows.images import float_formats, integer_formats
-from workflows.simulation.scene import Scene
 
 PROBLEM = "application/problem+json"
 WHITE = float_formats.encode_exr("RGB", np.ones((3, 4, 3), np.float32))
@@ -62,7 +61,7 @@ def test_all_layers_in_one_exr_with_the_requested_lobes(service: Service, matte:
             np.testing.assert_allclose(held[lit], channels["A"].pixels[lit], atol=2e-3)
 
 
-def test_stmap_points_at_the_monitor(service: Service, matte: str, scene: Scene) -> None:
+def test_stmap_points_at_the_monitor(service: Service, matte: str) -> None:
     pixels = float_formats.decode(service.client.layer(matte, "stmap.exr"), memory=1 << 24)
     # beside the ball the monitor is seen as it is: u to the right, v up
     beside = np.median(pixels[:, :3, 0]), np.median(pixels[:, -3:, 0])

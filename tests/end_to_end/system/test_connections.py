@@ -14,6 +14,7 @@ import pytest
 from services.api.http import slow_clients
 from tests.end_to_end.conftest import Service
 from tests.parts.waiting import until
+from tests.services.api.http.test_slow_clients import rest
 
 
 @contextlib.contextmanager
@@ -25,15 +26,6 @@ def connected(service: Service, count: int = 1) -> Iterator[list[socket.socket]]
             stack.enter_context(socket.create_connection((url.hostname, url.port), timeout=90))
             for _ in range(count)
         ]
-
-
-def answer(connection: socket.socket) -> bytes:
-    """Everything received until the other side closes."""
-    received = b""
-    with contextlib.suppress(ConnectionResetError):
-        while part := connection.recv(1 << 16):
-            received += part
-    return received
 
 
 @pytest.mark.slow
@@ -52,7 +44,7 @@ def test_thousands_of_idle_connections_are_served_around_and_closed(service: Ser
                     start = time.perf_counter()
                     assert service.http.get("/healthz").status_code == 200
                     times.append(time.perf_counter() - start)
-                assert answer(idle[-1]) == b""
+                assert rest(idle[-1]) == b""
             until(lambda: process.num_fds() - before <= 50)
             slowest = 1e3 * statistics.quantiles(times, n=100)[98]
             print(f"{peak} of {count} idle connections held at once: {slowest:.1f} ms at p99")
@@ -119,7 +111,7 @@ def test_malformed_request_is_refused_and_disconnected(service: Service, sent: b
     with connected(service) as (connection,):
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             connection.sendall(sent)
-        received = answer(connection)
+        received = rest(connection)
     assert received[:12] in (b"", b"HTTP/1.1 400", b"HTTP/1.1 501")
     assert received.count(b"HTTP/1.1 ") <= 1  # what is behind a request that is refused is none
     assert service.http.get("/healthz").status_code == 200
@@ -131,5 +123,5 @@ def test_half_closed_connection_is_closed(service: Service) -> None:
         with connected(service) as (half,):
             half.sendall(sent)
             half.shutdown(socket.SHUT_WR)
-            assert answer(half)[:12] in (b"", b"HTTP/1.1 200", b"HTTP/1.1 400")
+            assert rest(half)[:12] in (b"", b"HTTP/1.1 200", b"HTTP/1.1 400")
     assert service.http.get("/healthz").status_code == 200

@@ -19,7 +19,7 @@ from workflows.programs.program import Program
 from workflows.simulation.scene import Scene, write_capture
 
 
-def test_an_upload_is_ingested(service: Service, capture_archive: Path, scene: Scene) -> None:
+def test_an_upload_is_ingested(service: Service, capture_archive: Path) -> None:
     headers = {"Content-Type": "application/zip"}
     answer = service.http.post(
         "/v1/captures?name=mine", content=capture_archive.read_bytes(), headers=headers

@@ -180,5 +180,5 @@ def test_deleted_program_is_gone_with_its_files(service: Service) -> None:
     assert service.http.post("/v1/programs", json=request).headers["location"] == url
 
 
-def test_the_display_has_the_monitor_inside(service: Service, program: dict) -> None:
+def test_the_display_has_the_monitor_inside(program: dict) -> None:
     assert Border.model_validate(program["display"]).inner[2:] == (296, 216)

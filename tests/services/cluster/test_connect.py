@@ -191,9 +191,7 @@ def test_finished_tasks_leave_almost_nothing_in_memory(cluster: Cluster, client:
 
 
 @pytest.mark.slow
-def test_task_over_the_memory_limit_is_blamed_at_once(
-    cluster: Cluster, client: Client, tmp_path: Path
-) -> None:
+def test_task_over_the_memory_limit_is_blamed_at_once(cluster: Cluster, client: Client) -> None:
     limit = 700 << 20
     with working(
         cluster.folder, cluster.address, "--workers", "1", ENVMATTE_WORKER_MEMORY=str(limit)

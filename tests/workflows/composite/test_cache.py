@@ -66,16 +66,6 @@ def test_least_recently_used_strips_are_dropped(
     assert len(reads) == 4
     cache.strip("m", 1, 0)
     assert len(reads) == 5
-
-
-@pytest.mark.slow
-def test_matte_of_twice_the_memory_is_read(objects: Objects, matte: Matte) -> None:
-    memory = 2 * (read_strip(matte, 0, 0).nbytes + read_strip(matte, 0, 1).nbytes)
-    cache = Cache(objects, memory)
-    for _ in range(2):
-        found = [number(cache.strip("m", row, part)) for row in range(4) for part in range(2)]
-        assert found == [0, 8, 100, 108, 200, 208, 300, 308]
-        assert cache.bytes <= memory
     assert number(Cache(objects, 0).strip("m", 1, 1)) == 108
 
 

@@ -12,35 +12,19 @@ from numpy.typing import NDArray
 from storage.layout import mattes
 from storage.layout.mattes import Block, Matte
 from storage.objects.store import Objects
+from tests.workflows.composite.live.nodes.drawing import CROSSTALK, few_nodes
 from workflows.composite import composite
 from workflows.composite.live import encode
 from workflows.composite.live.encode import LOOKUPS, encode_live
 from workflows.recovery.pyramid import Pyramid
 
 HEIGHT, WIDTH, COLUMNS, ROWS = 20, 35, 75, 37
-CROSSTALK = [[0.9, 0.1, 0], [0.05, 0.8, 0.15], [0.02, 0.18, 0.8]]
 
 
 @pytest.fixture
 def matte(objects: Objects) -> Matte:
     """A matte of as many nodes a row as there are lookups, at most."""
-    rng = np.random.default_rng(0)
-    nodes = Pyramid.over(COLUMNS, ROWS).nodes
-    made = mattes.create(
-        objects, "m", height=HEIGHT, width=WIDTH, columns=COLUMNS, rows=ROWS, crosstalk=CROSSTALK
-    )
-    for at in np.ndindex(made.block_rows, made.block_columns):
-        shape = tuple(part.stop - part.start for part in made.span(*at))
-        recovered = rng.random(shape) < 0.8
-        S, rho = (rng.random((2, *shape, 3), np.float32) * recovered[..., np.newaxis]).astype(np.float32)
-        count = np.zeros((*shape, 3), np.uint32)
-        count[..., 0] = rng.integers(1, LOOKUPS + 1, shape) * recovered
-        cells = [np.sort(rng.choice(nodes, n, replace=False)) for n in count[..., 0].flat]
-        weights = [(w := rng.random(n) + 0.1) / w.sum() for n in count[..., 0].flat]
-        error = np.zeros(shape, np.float32)
-        cell, weight = np.concatenate(cells).astype(np.uint32), np.concatenate(weights).astype(np.float32)
-        made.write(*at, Block(S, rho, error, recovered, recovered, count, cell, weight))
-    return made
+    return few_nodes(objects, LOOKUPS)
 
 
 def drawn(data: bytes, backdrop: NDArray[np.float32]) -> tuple[NDArray[np.float64], dict[str, Any]]:

@@ -118,7 +118,7 @@ def steady(ball: Ball) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ball", ["default", "quick"], indirect=True)
-def test_steady_frames_are_unchanged(ingest: Ingest, objects: Objects, digests: Digests, ball: Ball) -> None:
+def test_steady_frames_are_unchanged(ingest: Ingest, ball: Ball) -> None:
     stack = ingest("c", filmed(ball, *steady(ball)))
     made = report(stack.attributes, stack.frames)
     assert made.drift is not None

@@ -131,9 +131,7 @@ def test_cover_or_preview_before_the_film_is_left_out(count: int) -> None:
 
 
 @pytest.mark.slow
-def test_frames_larger_than_the_container_says_are_never_decoded(
-    ingest_film: IngestFilm, light: list[np.ndarray]
-) -> None:
+def test_frames_larger_than_the_container_says_are_never_decoded(ingest_film: IngestFilm) -> None:
     large = np.full((2400, 3200, 3), 0.5, np.float32)
     bomb = bytearray(film([large] * 2, Camera(fps=24, hold=0.1, lead=0, tail=0)).data)
     at = bomb.index(b"avc1") + 4 + 24  # width and height of the sample entry
