@@ -1,11 +1,11 @@
 // Plays a program full screen, and reports its progress to the service for a phone that follows.
 import { LEAD, LEAD_SECONDS, borderOn, draw, schedule } from "./border.js";
-import { authorization, newKey } from "../app/lib/api.js";
+import { newKey, received, request } from "../app/lib/api.js";
 import { checks } from "../app/film/checklist.js";
 import { countScreen, knownScreen, onZoom, rememberScreen } from "../app/film/screen.js";
 import { loadWords } from "../app/lib/language.js";
 import { parts, said, t } from "../app/lib/words.js";
-import { h } from "../app/lib/dom.js";
+import { h, sentence } from "../app/lib/dom.js";
 import { follow } from "../app/lib/events.js";
 
 const COUNTDOWN = 5; // seconds
@@ -26,7 +26,7 @@ class Pictures {
 		const work = async () => {
 			while (next < count) {
 				const n = next++;
-				this.#blobs[n] = await (await fetched(`patterns/${n}.png`)).blob();
+				this.#blobs[n] = await received((await fetched(`patterns/${n}.png`)).blob());
 				progress(++done / count);
 			}
 		};
@@ -129,14 +129,17 @@ const measure = (element) =>
 
 const $ = (id) => document.getElementById(id);
 const setStatus = (text) => ($("status").textContent = text);
+const fail = ({ title, detail, message }) => setStatus(title ? `${said(title)}. ${sentence(said(detail))}` : message);
 const here = new URL(".", location.href);
 const sizeOf = ({ width, height }) => `${width} × ${height}`;
 
-async function ask(path, options = {}) {
-	const answer = await fetch(new URL(path, here), { ...options, headers: { ...options.headers, ...authorization() } });
-	if (answer.status === 401) $("unlock").hidden = false;
-	if (!answer.ok) throw new Error(said((await answer.json()).detail));
-	return answer;
+async function ask(path, options) {
+	try {
+		return await request(new URL(path, here), options);
+	} catch (error) {
+		if (error.status === 401) $("unlock").hidden = false;
+		throw error;
+	}
 }
 
 const id = here.pathname.split("/").at(-2);
@@ -165,13 +168,13 @@ function checkFit({ display, program }, found) {
 	const zoom = real && !isWindow ? zoomBetween(countScreen(), real) : 100;
 	const zoomed = t(isMeasured ? "play.zoomed" : "play.maybe", { zoom });
 	$("misfit").textContent = zoom === 100 ? misfit : `${zoomed} ${isMeasured ? "" : `${t("play.stays")} `}${misfit}`;
-	$("refit").onclick = () => refit(program, { width, height }).catch((error) => setStatus(error.message));
+	$("refit").onclick = () => refit(program, { width, height }).catch(fail);
 	$("fit").hidden = fits;
 	return fits;
 }
 
 async function open() {
-	const program = await (await ask(`../${id}`)).json();
+	const program = await received((await ask(`../${id}`)).json());
 	const { patterns, monitor } = program;
 	$("about").textContent = t("play.about", { n: patterns, size: sizeOf(monitor) });
 	checkFit(program, knownScreen());
@@ -194,7 +197,7 @@ const disable = (is) => {
 async function refit(program, monitor) {
 	const body = JSON.stringify({ program, monitor, border: true });
 	const answer = await ask("../../programs", { method: "POST", body, headers: { "Content-Type": "application/json" } });
-	location.assign(new URL(`../${(await answer.json()).id}/play`, here));
+	location.assign(new URL(`../${(await received(answer.json())).id}/play`, here));
 }
 
 // Shows white in the border until a click, a key, or a camera that sees it starts the program.
@@ -292,7 +295,7 @@ async function play(program, pictures, rate, how) {
 		report({ ...progress, phase: "shown", shown: program.patterns });
 	} catch (error) {
 		reportStop();
-		setStatus(error.message);
+		fail(error);
 	} finally {
 		stop.abort();
 		if (history.state?.showing && !document.hidden) history.back();
@@ -334,5 +337,5 @@ $("checks").append(...checks().map((text) => Object.assign(document.createElemen
 $("follow").href = new URL(`/#/film/${id}`, here);
 document.querySelector("main").hidden = false; // at once, since words that come later would shift what is below
 
-const start = () => open().catch((error) => setStatus(error.message));
+const start = () => open().catch(fail);
 start();

@@ -306,6 +306,21 @@ def test_page_asks_for_a_key_where_needed(tab: Page, tmp_path_factory: pytest.Te
         expect(key).to_be_hidden()
 
 
+def test_pictures_that_do_not_come_at_first_or_at_all(tab: Page, service: Service) -> None:
+    program = posted(service)
+    pictures = "**/patterns/7.png"
+    tab.route(pictures, lambda route: route.abort("connectionreset"), times=1)
+    go(tab, service, program)
+    for answer, words in (
+        (lambda route: route.abort("connectionreset"), "The service does not answer. Check that it runs"),
+        (lambda route: route.fulfill(status=502, body="<html>"), "The service answered with 502."),
+    ):
+        tab.route(pictures, answer)
+        tab.reload()
+        expect(tab.get_by_role("status")).to_contain_text(words)
+        tab.unroute(pictures)
+
+
 def test_aiming_shows_white_in_the_border_until_a_camera_sees_it(tab: Page, service: Service) -> None:
     program = posted(service)
     go(tab, service, program)

@@ -65,15 +65,23 @@ export const received = (promise, signal) => promise.catch(() => {
 	throw signal?.aborted ? signal.reason : unreachable();
 });
 
-// Requests a path: resolves with the response, or throws a Problem as the API words it. Asks for a key where needed.
-export async function ask(path, options = {}) {
+// Requests a path: resolves with the response, or throws a Problem as the API words it.
+export async function request(path, options = {}) {
+	const answer = await received(fetchTwice(path, { ...options, headers: { ...options.headers, ...authorization() } }), options.signal);
+	if (answer.ok) return answer;
+	throw new Problem(await describe(answer));
+}
+
+// The same, asking for a key where needed.
+export async function ask(path, options) {
 	for (;;) {
 		const used = key();
-		const answer = await received(fetchTwice(path, { ...options, headers: { ...options.headers, ...authorization() } }), options.signal);
-		if (answer.ok) return answer;
-		const problem = new Problem(await describe(answer));
-		if (answer.status !== 401) throw problem;
-		if (used === key()) await unlock(problem);
+		try {
+			return await request(path, options);
+		} catch (error) {
+			if (error.status !== 401) throw error;
+			if (used === key()) await unlock(error);
+		}
 	}
 }
 
