@@ -220,15 +220,11 @@ def test_frames_of_one_pattern_are_averaged(
 
 
 def test_a_damaged_stack_is_corrupt(
-    recover: Callable[..., tuple[mattes.Matte, int]],
-    objects: Objects,
-    folder: Path,
-    archives: dict[bool, bytes],
+    ingest: Callable[..., Stack], objects: Objects, folder: Path, archives: dict[bool, bytes]
 ) -> None:
-    recover(archives[False])
+    ingest("c", archives[False])
     chunk = next(path for path in (folder / "captures/c/frames/c").rglob("*") if path.is_file())
     chunk.unlink()
-    objects.delete(mattes.path("m"))
     task = Task("j", "c", "m", {}, Limits(1 << 30, 1 << 26))
     plan = run(STEPS, objects, task, PREPARE)[1]
     with pytest.raises(Corrupt, match="frames"):
@@ -256,17 +252,14 @@ def test_frames_that_are_moved_back_are_the_same_in_any_tile(
     assert made[0] == made[1] == made[2]
 
 
-@pytest.mark.parametrize(("capture", "matte"), [("c", "none"), ("none", "m")])
 def test_missing_capture_or_matte_is_corrupt(
-    recover: Callable[..., tuple[mattes.Matte, int]],
-    objects: Objects,
-    archives: dict[bool, bytes],
-    capture: str,
-    matte: str,
+    ingest: Callable[..., Stack], objects: Objects, archives: dict[bool, bytes]
 ) -> None:
-    recover(archives[False], tile=1024)
-    with pytest.raises(Corrupt, match="none is not in the store"):
-        run(STEPS, objects, Task("j", capture, matte, {}, Limits(1, 1)), 0)
+    ingest("c", archives[False])
+    run(STEPS, objects, Task("j", "c", "m", {}, Limits(1 << 30, 1 << 26)), PREPARE)
+    for of, to in (("c", "none"), ("none", "m")):
+        with pytest.raises(Corrupt, match="none is not in the store"):
+            run(STEPS, objects, Task("j", of, to, {}, Limits(1, 1)), 0)
 
 
 def bracketed(data: bytes, exposures: tuple[float, ...]) -> bytes:

@@ -129,9 +129,8 @@ def test_nodes_without_kernels(objects: Objects, tmp_path: Path) -> None:
     assert _unconnected(nodes) == {"image"}
 
 
-@pytest.mark.parametrize(
-    "name", ["lens", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ball", "tumbler"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["lens", "ball", "tumbler"])
 def test_blurs_draw_nearly_the_composite(objects: Objects, tmp_path: Path, name: str) -> None:
     found = measure_blurs(recovered(objects, name), tmp_path, LOOKUPS)
     least = {"photo": 44, "strokes": 44, "ramp": 70, "tiles": 37, "checker": 36}
