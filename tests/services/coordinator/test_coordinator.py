@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,15 @@ from tests.benchmarks.cluster.overhead import measure
 from tests.parts.waiting import until
 from tests.services.coordinator.dispatchers import Failing, Idle, Refusing, Working
 
+Coordinate = Callable[[Any], Coordinator]
 OTHERS = 15
 """Writes once per job, or every few seconds in any case: start, stages, lease."""
+
+
+@pytest.fixture
+def coordinate(engine: Engine, objects: Objects, tmp_path: Path) -> Coordinate:
+    """Makes a coordinator that gives tasks to a dispatcher."""
+    return lambda dispatcher: Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher)
 
 
 @pytest.fixture
@@ -43,7 +50,7 @@ def job(engine: Engine, objects: Objects) -> str:
 
 
 def test_job_cancelled_while_it_is_started_is_not_run(
-    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, objects: Objects, job: str, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def cancelled_meanwhile(connection: Connection, row: Row[Any]) -> bool:
         with writing(engine) as c:
@@ -52,7 +59,7 @@ def test_job_cancelled_while_it_is_started_is_not_run(
 
     monkeypatch.setattr(JOB_KINDS["ingest"], "is_due", cancelled_meanwhile)
     dispatcher = Idle()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
         until(lambda: not objects.paths_below("uploads"))
     assert dispatcher.submitted == []
     with reading(engine) as c:
@@ -60,7 +67,7 @@ def test_job_cancelled_while_it_is_started_is_not_run(
 
 
 def test_job_cancelled_after_it_was_read_is_cleaned_up_as_such(
-    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, objects: Objects, job: str, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = jobs.to_run
 
@@ -78,18 +85,18 @@ def test_job_cancelled_after_it_was_read_is_cleaned_up_as_such(
     monkeypatch.setattr(JOB_KINDS["ingest"], "is_due", without_its_capture)
     ended: list[str] = []
     monkeypatch.setattr(JOB_KINDS["ingest"], "cancelled", lambda c, row: ended.append(row.id))
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, Idle()):  # type: ignore[arg-type]
+    with coordinate(Idle()):
         until(lambda: not objects.paths_below("uploads"))
     assert ended == [job]
 
 
 def test_paused_job_is_not_run_until_it_is_continued(
-    engine: Engine, objects: Objects, job: str, tmp_path: Path
+    engine: Engine, job: str, coordinate: Coordinate
 ) -> None:
     with writing(engine) as c:
         jobs.pause(c, job, True)
     dispatcher = Idle()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
         time.sleep(3 * POLL)
         assert dispatcher.submitted == []
         with writing(engine) as c:
@@ -102,14 +109,14 @@ def test_paused_job_is_not_run_until_it_is_continued(
 
 
 def test_superseded_coordinator_drops_its_jobs_and_writes_nothing(
-    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, job: str, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(coordinator, "BEAT", 3600.0)  # as if it were frozen between two heartbeats
     monkeypatch.setattr(leases, "SECONDS", 3600.0)
     with writing(engine) as c:
         leases.acquire(c, "one that was killed")  # no other runs on the same folder: it need not wait
     dispatcher = Idle()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher) as one:  # type: ignore[arg-type]
+    with coordinate(dispatcher) as one:
         until(lambda: dispatcher.submitted)
         with writing(engine) as c:
             other = leases.acquire(c, "another", seize=True)
@@ -148,22 +155,22 @@ def ready(engine: Engine) -> None:
 
 
 def test_tiles_that_could_not_be_submitted_are_submitted_again(
-    engine: Engine, objects: Objects, ready: None, tmp_path: Path
+    engine: Engine, ready: None, coordinate: Coordinate
 ) -> None:
     job = recovery(engine, "m", 3)
     dispatcher = Refusing()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
         until(lambda: len(dispatcher.submitted) == 3)
     assert dispatcher.submitted == [(job, tile) for tile in dispatcher.refused]
 
 
 def test_jobs_share_the_workers_from_the_start_of_the_later_one(
-    engine: Engine, objects: Objects, ready: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, ready: None, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(coordinator, "POLL", 0.02)
     large = recovery(engine, "large", 1000)
     dispatcher = Working()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
         until(lambda: len(dispatcher.done) >= 10)
         small = recovery(engine, "small", 9)
         until(lambda: dispatcher.done.count(small) >= 9)
@@ -185,7 +192,7 @@ def test_job_that_cannot_be_run_holds_up_no_other(
     engine: Engine,
     objects: Objects,
     job: str,
-    tmp_path: Path,
+    coordinate: Coordinate,
     monkeypatch: pytest.MonkeyPatch,
     trouble: str,
     problem: str | None,
@@ -207,7 +214,7 @@ def test_job_that_cannot_be_run_holds_up_no_other(
         newer = jobs.add(c, "newer", "ready", {})
         jobs.cancel(c, newer)
     dispatcher = Idle()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
         if trouble == "region":
             until(lambda: (bad, 0) in dispatcher.submitted)
             with writing(engine) as c:
@@ -229,12 +236,7 @@ def test_job_that_cannot_be_run_holds_up_no_other(
 
 @pytest.mark.parametrize("error", [Unavailable("the database is busy"), KeyError("odd")])
 def test_what_cannot_expire_neither_costs_the_lease_nor_holds_up_jobs(
-    engine: Engine,
-    objects: Objects,
-    job: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    error: Exception,
+    engine: Engine, job: str, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     def failing(connection: Connection) -> list[str]:
         raise error
@@ -242,7 +244,7 @@ def test_what_cannot_expire_neither_costs_the_lease_nor_holds_up_jobs(
     monkeypatch.setattr(coordinator, "delete_expired", failing)
     monkeypatch.setattr(coordinator, "BEAT", 0.1)
     dispatcher = Idle()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
         until(lambda: dispatcher.submitted, 30)
         time.sleep(1.5)
         until(lambda: since_heartbeat(engine) < 1.4)
@@ -256,7 +258,7 @@ def since_heartbeat(engine: Engine) -> float:
 
 
 def test_troubles_before_a_retry_do_not_count(
-    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, job: str, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     troubles = 3
 
@@ -269,7 +271,7 @@ def test_troubles_before_a_retry_do_not_count(
 
     monkeypatch.setattr(JOB_KINDS["ingest"], "is_due", confused)
     dispatcher = Idle()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
 
         def row() -> Row[Any]:
             with reading(engine) as c:
@@ -285,7 +287,7 @@ def test_troubles_before_a_retry_do_not_count(
 
 
 def test_recovery_takes_no_transaction_while_its_capture_is_ingested(
-    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, job: str, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[str] = []
     is_due = JOB_KINDS["recover"].is_due
@@ -299,7 +301,7 @@ def test_recovery_takes_no_transaction_while_its_capture_is_ingested(
         recovery = jobs.add(c, "recover", "c", {}, "m")
         mattes.add(c, "m", "c", recovery, {})
     dispatcher = Idle()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
         until(lambda: dispatcher.submitted)
         time.sleep(3 * POLL)
         assert looked == []
@@ -311,7 +313,7 @@ def test_recovery_takes_no_transaction_while_its_capture_is_ingested(
 
 @pytest.mark.parametrize("what", ["start", "clean-up"])
 def test_lease_is_renewed_while_many_jobs_are_started_or_cleaned_up(
-    engine: Engine, objects: Objects, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+    engine: Engine, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     seen: list[str] = []
     renew = leases.renew
@@ -333,19 +335,19 @@ def test_lease_is_renewed_while_many_jobs_are_started_or_cleaned_up(
         if what == "clean-up":
             for job in many:
                 jobs.cancel(c, job)
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, Idle()):  # type: ignore[arg-type]
+    with coordinate(Idle()):
         until(lambda: set(many) <= set(seen))
     assert [one for one in seen if one != "renewed"] == many
     assert all("renewed" in seen[seen.index(a) : seen.index(b)] for a, b in pairwise(many))
 
 
 def test_job_without_the_store_is_tried_again_and_says_so(
-    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, job: str, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(job_run, "HOLD", 0.5)
     monkeypatch.setattr(coordinator, "BEAT", 0.1)
     dispatcher, begin = Failing(StoreUnavailable("it is away")), time.monotonic()
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
         until(lambda: len(dispatcher.tried) == 4)
         assert time.monotonic() - begin > 3 * job_run.HOLD
         time.sleep(3 * coordinator.BEAT)
@@ -356,7 +358,7 @@ def test_job_without_the_store_is_tried_again_and_says_so(
 
 
 def test_files_that_cannot_be_removed_are_removed_later(
-    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, objects: Objects, job: str, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failures = [OSError("Directory not empty"), Unavailable("the store does not answer")]
     remove = JOB_KINDS["ingest"].remove_files
@@ -370,13 +372,13 @@ def test_files_that_cannot_be_removed_are_removed_later(
     monkeypatch.setattr(coordinator, "AGAIN", 0.1)
     with writing(engine) as c:
         jobs.cancel(c, job)
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, Idle()):  # type: ignore[arg-type]
+    with coordinate(Idle()):
         until(lambda: not failures)  # a sweep may have removed them before
         until(lambda: not objects.paths_below("uploads"))
 
 
 def test_files_of_a_failed_job_are_removed_if_it_is_deleted_at_once(
-    engine: Engine, objects: Objects, job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, objects: Objects, job: str, coordinate: Coordinate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def deleted_meanwhile(run: JobRun, following: Next) -> None:
         with writing(engine) as c:
@@ -385,7 +387,7 @@ def test_files_of_a_failed_job_are_removed_if_it_is_deleted_at_once(
     monkeypatch.setattr(JobRun, "advance", deleted_meanwhile)
     monkeypatch.setattr(coordinator, "DYING", 0.1)
     dispatcher = Failing(CaptureError("no frames"))
-    with Coordinator(CoordinatorSettings(data=tmp_path), engine, objects, dispatcher):  # type: ignore[arg-type]
+    with coordinate(dispatcher):
         until(lambda: not objects.paths_below("uploads"), 10)
     assert dispatcher.tried == [(job, PREPARE)]
 
