@@ -11,9 +11,8 @@ def until(
     """Wait until a condition is true; fail after a while, or once the process that makes it true has ended."""
     deadline = time.monotonic() + seconds
     while True:
-        has_ended = (
-            by is not None and by.poll() is not None
-        )  # before the condition, which may be its last act
+        # Before the condition, which may be its last act.
+        has_ended = by is not None and by.poll() is not None
         if condition():
             return
         assert not has_ended, f"not true when the process ended with {by and by.returncode}"

@@ -137,9 +137,8 @@ def _queue(context: Context, request: JobRequest, key: str | None) -> Job:
     if earlier is not None:
         return earlier
     with reading(context.engine) as c:
-        admit(
-            c, context.settings, NewData(jobs=1)
-        )  # again below, where it is certain; to read a program takes longer
+        # Again below, where it is certain; to read a program takes longer.
+        admit(c, context.settings, NewData(jobs=1))
         captures.get(c, request.capture)
         program = captures.program_json(c, request.capture)
     # Grids that do not nest are refused here, not by the job; and before the transaction, for which others wait.
