@@ -3,7 +3,7 @@
 import asyncio
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -11,10 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fastapi import Request
+from fastapi import FastAPI, Request
 from fastapi.testclient import TestClient
 
-from services.api.app import build_app
 from services.api.auth import Caller, identify
 from services.api.context import KEY_CHECK, Context
 from services.api.work import RequestShares, Shares
@@ -124,15 +123,15 @@ def test_calls_that_wait_hold_up_no_other_owner(context: Context) -> None:
 
 
 @pytest.mark.parametrize("route", ["captures", "mattes"])
-def test_archives_are_checked_once_there_is_memory(tmp_path: Path, route: str) -> None:
+def test_archives_are_checked_once_there_is_memory(
+    tmp_path: Path, build: Callable[..., FastAPI], route: str
+) -> None:
     if route == "mattes":
         sent = archive(tmp_path / "made", 8, 8)
     else:
         program = nested_program(bands=((8, 6, 16),), levels=2)
         sent = captured(program, lambda n, picture: np.zeros((8, 8, 1)))
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    settings = Settings(data=tmp_path, request_seconds=1)
-    app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
+    app = build(request_seconds=1)
     memory = app.state.context.shares.memory
     with TestClient(app, "http://127.0.0.1", headers={"Content-Type": "application/zip"}) as client:
         assert client.portal is not None
@@ -143,14 +142,10 @@ def test_archives_are_checked_once_there_is_memory(tmp_path: Path, route: str) -
             answer = client.post(f"/v1/{route}", content=sent)
             assert (answer.status_code, answer.json()["type"]) == (429, "urn:envmatte:problem:too-many")
         assert client.post(f"/v1/{route}", content=sent).status_code == 201
-    app.state.context.decoders.close()
-    engine.dispose()
 
 
-def test_archives_are_sent_in_turn(tmp_path: Path) -> None:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    settings = Settings(data=tmp_path, request_seconds=1)
-    app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
+def test_archives_are_sent_in_turn(tmp_path: Path, build: Callable[..., FastAPI]) -> None:
+    app = build(request_seconds=1)
     archives, sent = app.state.context.shares.archives, archive(tmp_path / "made", 8, 8)
     with TestClient(app, "http://127.0.0.1", headers={"Content-Type": "application/zip"}) as client:
         assert client.portal is not None
@@ -163,5 +158,3 @@ def test_archives_are_sent_in_turn(tmp_path: Path) -> None:
             assert (answer.status_code, answer.json()["type"]) == (429, "urn:envmatte:problem:too-many")
         assert client.get(f"/v1/mattes/{matte}/archive").content == sent
         assert client.get("/v1/mattes/none/archive").status_code == 404
-    app.state.context.decoders.close()
-    engine.dispose()

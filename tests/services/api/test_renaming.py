@@ -1,29 +1,23 @@
 """Renaming captures and mattes, and finding them by their names."""
 
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from sqlalchemy import Engine
 
-from services.api.app import build_app
-from services.settings import Settings
-from storage.database.engine import open_engine, writing
-from storage.objects.store import Objects
+from storage.database.engine import writing
 from storage.records import captures, mattes
 
 
 @pytest.fixture
-def http(tmp_path: Path) -> Iterator[TestClient]:
+def http(engine: Engine, build: Callable[..., FastAPI]) -> TestClient:
     """An API with a capture and a matte, both of the id "ball"."""
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
     with writing(engine) as c:
         captures.add(c, "ball", "j", name="ball", bytes=1, frames=1, program={})
         mattes.add_imported(c, "ball", {}, {}, name="ball")
-    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
-    yield TestClient(app, "http://localhost")
-    app.state.context.decoders.close()
-    engine.dispose()
+    return TestClient(build(), "http://localhost")
 
 
 @pytest.mark.parametrize("collection", ["captures", "mattes"])

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import Engine
 
 from services.api.app import build_app
 from services.runtime.tracing import TRACED, TRACEPARENT
 from services.settings import Settings
-from storage.database.engine import open_engine, reading, writing
+from storage.database.engine import reading, writing
 from storage.objects.store import Objects
 from storage.records import jobs, mattes
 from tests.services.runtime.collector import Collector, collecting
@@ -92,19 +93,17 @@ def test_requests_that_make_jobs_are_spans_in_the_callers_trace() -> None:
     assert {span.attributes["http.response.status_code"] for span in collector.spans} == {201}
 
 
-def test_every_request_that_makes_a_job_is_traced(tmp_path: Path) -> None:
-    engine = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
-    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
-    engine.dispose()
+def test_every_request_that_makes_a_job_is_traced(engine: Engine, objects: Objects, tmp_path: Path) -> None:
+    app = build_app(Settings(data=tmp_path), engine, objects)
     posts = {path: item["post"] for path, item in app.openapi()["paths"].items() if "post" in item}
     queued = {path for path, post in posts.items() if "202" in post["responses"]}
     assert TRACED.keys() == queued | {"/v1/captures"}
 
 
-def test_a_retried_job_continues_in_the_trace_of_the_retry(tmp_path: Path) -> None:
-    engine = open_engine(f"sqlite:///{tmp_path / 'ledger.db'}")
-    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
-    client = TestClient(app, "http://localhost")
+def test_a_retried_job_continues_in_the_trace_of_the_retry(
+    engine: Engine, objects: Objects, tmp_path: Path
+) -> None:
+    client = TestClient(build_app(Settings(data=tmp_path), engine, objects), "http://localhost")
     again = CALLER.replace("0123", "4567")
     with writing(engine) as c:
         mattes.add_imported(c, "m", {}, {})
@@ -116,7 +115,6 @@ def test_a_retried_job_continues_in_the_trace_of_the_retry(tmp_path: Path) -> No
         assert client.post(f"/v1/jobs/{job}/retry", headers=headers).status_code == 202
         with reading(engine) as c:
             assert jobs.get(c, job).trace == again
-    engine.dispose()
 
 
 def spans(collector: Collector, parent: str | None = None, **environment: str) -> list[str]:

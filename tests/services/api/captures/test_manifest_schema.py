@@ -2,19 +2,16 @@
 
 import json
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from jsonschema import Draft202012Validator
 
-from services.api.app import build_app
 from services.runtime.problems import CAPTURE_SCHEMA
-from services.settings import Settings
-from storage.database.engine import open_engine
-from storage.objects.store import Objects
 from tests.parts.captures import nested_program, zip_bytes
 from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
@@ -23,12 +20,8 @@ ZIP = {"Content-Type": "application/zip"}
 
 
 @pytest.fixture
-def http(tmp_path: Path) -> Iterator[TestClient]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
-    yield TestClient(app, "http://localhost")
-    app.state.context.decoders.close()
-    engine.dispose()
+def http(build: Callable[..., FastAPI]) -> TestClient:
+    return TestClient(build(), "http://localhost")
 
 
 @pytest.fixture

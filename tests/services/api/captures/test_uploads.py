@@ -1,15 +1,14 @@
 """Uploads whose rows and bytes must agree, and their keys: the app with a real database and store."""
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import Engine, PoolProxiedConnection, event, func, select
 
-from services.api.app import build_app
-from services.settings import Settings
 from storage.database.engine import open_engine, reading
 from storage.database.tables import uploads
 from storage.objects.store import Objects
@@ -30,11 +29,9 @@ def engine(database_url: str) -> Iterator[Engine]:
 
 
 @pytest.fixture
-def client(engine: Engine, objects: Objects, tmp_path: Path) -> Iterator[TestClient]:
-    app = build_app(Settings(data=tmp_path), engine, objects)
-    with TestClient(app, "http://127.0.0.1") as client:
+def client(build: Callable[..., FastAPI]) -> Iterator[TestClient]:
+    with TestClient(build(), "http://127.0.0.1") as client:
         yield client
-    app.state.context.decoders.close()
 
 
 def create(client: TestClient, length: int) -> str:

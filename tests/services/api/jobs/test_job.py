@@ -1,19 +1,17 @@
 """What the API says about jobs, from the rows of a database."""
 
 import time
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import Engine, event
 
-from services.api.app import build_app
 from services.api.jobs.job import Job
-from services.settings import Settings
 from storage.database.engine import reading, writing
 from storage.database.rows import page
 from storage.database.tables import jobs as table
-from storage.objects.store import Objects
 from storage.records import captures, jobs, leases, tiles
 
 
@@ -91,10 +89,10 @@ def test_job_without_progress_says_what_takes_long(engine: Engine) -> None:
             )
 
 
-def test_a_job_that_a_newer_service_queued_is_shown(tmp_path: Path, engine: Engine, objects: Objects) -> None:
+def test_a_job_that_a_newer_service_queued_is_shown(engine: Engine, build: Callable[..., FastAPI]) -> None:
     with writing(engine) as c:
         job = jobs.add(c, "newer", "c", {})
-    client = TestClient(build_app(Settings(data=tmp_path), engine, objects), "http://localhost")
+    client = TestClient(build(), "http://localhost")
     assert [found["kind"] for found in client.get("/v1/jobs").json()["jobs"]] == ["newer"]
     region = {"region": {"x": 0, "y": 0, "width": 1, "height": 1}}
     refused = client.patch(f"/v1/jobs/{job}", json=region)

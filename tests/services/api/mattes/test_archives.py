@@ -1,11 +1,13 @@
 """Archives of mattes while something else happens, as a restart of the database, and one that is too large."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
-from sqlalchemy import Engine, event
+from sqlalchemy import event
 
 from services.api.app import build_app
 from services.settings import Settings
@@ -57,11 +59,12 @@ def test_import_goes_on_although_the_database_restarts(
 
 
 def test_download_of_a_matte_that_is_deleted_ends_with_a_line_in_the_log(
-    sqlite: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    build: Callable[..., FastAPI],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    engine, objects = open_engine(sqlite), Objects((tmp_path / "store").as_uri())
-    app = build_app(Settings(data=tmp_path), engine, objects)
-    with TestClient(app, "http://127.0.0.1") as client:
+    with TestClient(build(), "http://127.0.0.1") as client:
         where = (
             "/v1/mattes/"
             + client.post("/v1/mattes", content=archive(tmp_path / "made", 100, 80), headers=ZIP).json()["id"]
@@ -75,15 +78,12 @@ def test_download_of_a_matte_that_is_deleted_ends_with_a_line_in_the_log(
     assert (answer.status_code, len(answer.content) < int(answer.headers["content-length"])) == (200, True)
     (line,) = [record for record in caplog.records if record.name.startswith("services.api")]
     assert (line.levelname, "there is no matte" in line.getMessage()) == ("INFO", True)
-    app.state.context.decoders.close()
-    engine.dispose()
 
 
-def test_archive_that_unpacks_to_too_much_is_refused_by_the_setting(engine: Engine, tmp_path: Path) -> None:
-    store = tmp_path / "store"
-    app = build_app(Settings(data=tmp_path, unpacked_bytes=100_000), engine, Objects(store.as_uri()))
-    with TestClient(app, "http://localhost") as client:
+def test_archive_that_unpacks_to_too_much_is_refused_by_the_setting(
+    build: Callable[..., FastAPI], tmp_path: Path
+) -> None:
+    with TestClient(build(unpacked_bytes=100_000), "http://localhost") as client:
         answer = client.post("/v1/mattes", content=archive(tmp_path / "other", 64, 64), headers=ZIP)
     assert (answer.status_code, answer.json()["limit"]) == (422, 100_000)
-    assert [path for path in store.rglob("*") if path.is_file()] == []
-    app.state.context.decoders.close()
+    assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []

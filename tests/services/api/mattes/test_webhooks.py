@@ -1,16 +1,14 @@
 """Webhooks given in a body, or in the query beside one that is not JSON: the app with a real database and store."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import Engine
 
-from services.api.app import build_app
-from services.settings import Settings
-from storage.database.engine import open_engine, reading, writing
-from storage.objects.store import Objects
+from storage.database.engine import reading, writing
 from storage.records import jobs, mattes
 from tests.parts.captures import nested_program
 from workflows.simulation import glass_ball
@@ -22,12 +20,13 @@ VIDEO = {"Content-Type": "video/mp4"}
 
 
 @pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
+def client(engine: Engine, build: Callable[..., FastAPI]) -> Callable[[bool], TestClient]:
+    """The API with a matte; webhooks may go to private addresses, or not."""
     with writing(engine) as c:
         mattes.add_imported(c, "m", {}, {})
-    yield engine
-    engine.dispose()
+    return lambda private: TestClient(
+        build(webhook_secret=16 * "s", webhook_private=private), "http://localhost"
+    )
 
 
 @pytest.fixture
@@ -37,20 +36,15 @@ def archive(tmp_path: Path) -> bytes:
     return (tmp_path / "ball.zip").read_bytes()
 
 
-def client(engine: Engine, tmp_path: Path, *, private: bool) -> TestClient:
-    """The API of a service without a coordinator: jobs stay queued."""
-    settings = Settings(data=tmp_path, webhook_secret=16 * "s", webhook_private=private)
-    app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
-    return TestClient(app, "http://localhost")
-
-
 def webhook_of(engine: Engine, job: str) -> str | None:
     with reading(engine) as c:
         return jobs.get(c, job).webhook
 
 
-def test_captures_and_clips_take_a_webhook(engine: Engine, archive: bytes, tmp_path: Path) -> None:
-    http = client(engine, tmp_path, private=True)
+def test_captures_and_clips_take_a_webhook(
+    engine: Engine, archive: bytes, client: Callable[[bool], TestClient]
+) -> None:
+    http = client(True)
     for query in ({"webhook": URL}, {}):
         capture = http.post("/v1/captures", content=archive, headers=ZIP, params=query)
         assert webhook_of(engine, capture.json()["job"]) == query.get("webhook")
@@ -60,8 +54,10 @@ def test_captures_and_clips_take_a_webhook(engine: Engine, archive: bytes, tmp_p
         assert clip.json()["options"].keys() == {"transfer", "around", "fit", "placement"}
 
 
-def test_private_address_is_refused(engine: Engine, archive: bytes, tmp_path: Path) -> None:
-    http, query = client(engine, tmp_path, private=False), {"webhook": URL.replace("http:", "https:")}
+def test_private_address_is_refused(
+    archive: bytes, client: Callable[[bool], TestClient], tmp_path: Path
+) -> None:
+    http, query = client(False), {"webhook": URL.replace("http:", "https:")}
     for url, body, headers in (
         ("/v1/captures", archive, ZIP),
         ("/v1/mattes/m/composite", b"clip", VIDEO),
@@ -74,8 +70,6 @@ def test_private_address_is_refused(engine: Engine, archive: bytes, tmp_path: Pa
     assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []
 
 
-def test_still_takes_no_webhook(engine: Engine, tmp_path: Path) -> None:
-    answer = client(engine, tmp_path, private=True).post(
-        "/v1/mattes/m/composite", content=b"picture", params={"webhook": URL}
-    )
+def test_still_takes_no_webhook(client: Callable[[bool], TestClient]) -> None:
+    answer = client(True).post("/v1/mattes/m/composite", content=b"picture", params={"webhook": URL})
     assert (answer.status_code, answer.json()["field"]) == (422, "webhook")

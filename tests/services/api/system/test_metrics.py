@@ -1,19 +1,16 @@
 """Metrics and the state of the cluster, from the rows of a database, with few short queries."""
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import Engine, delete, event, update
 
-from services.api.app import build_app
-from services.settings import Settings
 from storage.database import tables
 from storage.database.engine import writing
-from storage.objects.store import Objects
 from storage.records import captures, jobs, leases
 from storage.records import tiles as tile_records
 
@@ -21,9 +18,8 @@ PROGRAM = {"parts": []}
 
 
 @pytest.fixture
-def client(engine: Engine, tmp_path: Path) -> Iterator[TestClient]:
-    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
-    with TestClient(app, "http://localhost") as opened:
+def client(build: Callable[..., FastAPI]) -> Iterator[TestClient]:
+    with TestClient(build(), "http://localhost") as opened:
         yield opened
 
 

@@ -1,28 +1,21 @@
 """Files of the web app over HTTP: smaller than their sources, asked for again each time, and answered by 304."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from services.api.app import build_app
 from services.api.system import minified
 from services.api.system.pages import WEB
-from services.settings import Settings
-from storage.database.engine import open_engine
-from storage.objects.store import Objects
 
 FILES = ["app/main.js", "app/style.css", "app/icon.svg", "play/play.js"]
 
 
 @pytest.fixture
-def http(tmp_path: Path) -> Iterator[TestClient]:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    yield TestClient(
-        build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri())), "http://localhost"
-    )
-    engine.dispose()
+def http(build: Callable[..., FastAPI]) -> TestClient:
+    return TestClient(build(), "http://localhost")
 
 
 @pytest.mark.parametrize("name", FILES)

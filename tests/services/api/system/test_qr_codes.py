@@ -1,30 +1,21 @@
 """QR codes: of the service's own addresses, and of no others."""
 
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
 from xml.etree import ElementTree
 
 import httpx2
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from services.api.app import build_app
 from services.api.system import network
-from services.settings import Settings
-from storage.database.engine import open_engine
-from storage.objects.store import Objects
 
 
 @pytest.fixture
-def http(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
+def http(build: Callable[..., FastAPI], monkeypatch: pytest.MonkeyPatch) -> TestClient:
     """A service with a key that listens on all addresses, of which one is 192.168.1.5."""
     monkeypatch.setattr(network, "_own_address", lambda: "192.168.1.5")
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    settings = Settings(data=tmp_path, host="0.0.0.0", keys=("given",))
-    app = build_app(settings, engine, Objects((tmp_path / "store").as_uri()))
-    yield TestClient(app, "http://glass.test")
-    app.state.context.decoders.close()
-    engine.dispose()
+    return TestClient(build(host="0.0.0.0", keys=("given",)), "http://glass.test")
 
 
 def ask(http: TestClient, text: str) -> httpx2.Response:
@@ -70,12 +61,8 @@ def test_other_texts_are_refused(http: TestClient, text: str) -> None:
     assert (answer.status_code, answer.json()["type"]) == (422, "urn:envmatte:problem:bad-request")
 
 
-def test_service_on_loopback_has_no_other_address(tmp_path: Path) -> None:
-    engine = open_engine(f"sqlite:///{tmp_path}/ledger.db")
-    app = build_app(Settings(data=tmp_path), engine, Objects((tmp_path / "store").as_uri()))
-    http = TestClient(app, "http://localhost:8000")
+def test_service_on_loopback_has_no_other_address(build: Callable[..., FastAPI]) -> None:
+    http = TestClient(build(), "http://localhost:8000")
     assert ask(http, "http://localhost:8000/#/film").status_code == 200
     assert ask(http, "http://127.0.0.1:8000/#/film").status_code == 422
     assert ask(http, "http:///").status_code == 422
-    app.state.context.decoders.close()
-    engine.dispose()
