@@ -1,7 +1,6 @@
 """Jobs in the app: followed, cancelled, retried, deleted."""
 
 import re
-import socket
 from pathlib import Path
 
 import pytest
@@ -9,6 +8,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.browser.pages import MINUTE, ZIP, Held, wait
 from tests.end_to_end.conftest import Service, paused, serving
+from tests.parts.rig import free_port
 
 pytestmark = pytest.mark.slow
 
@@ -139,8 +139,7 @@ def test_restarted_service_with_keys(
     browser: Browser, ball: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("locked") / "data"
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = str(free.getsockname()[1])
+    port = str(free_port())
     settings = ("--workers", "1", "--port", port)
     with serving(folder, *settings, ENVMATTE_KEYS="secret") as locked:
         capture = locked.client.upload(ball)

@@ -4,7 +4,6 @@ import io
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import zipfile
@@ -16,6 +15,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 from tests.browser.pages import MINUTE, ZIP, Held, asks_before_closing, opened, wait
 from tests.end_to_end.conftest import Service, paused, serving
 from tests.parts.disks import small_disk
+from tests.parts.rig import free_port
 
 pytestmark = pytest.mark.slow
 
@@ -263,8 +263,7 @@ def test_service_restarts_with_another_key_during_upload(
     browser: Browser, ball: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "data"
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = str(free.getsockname()[1])
+    port = str(free_port())
     settings = ("--workers", "1", "--host", "0.0.0.0", "--port", port)
     with opened(browser) as page:
         with serving(folder, *settings, ENVMATTE_KEYS="first") as locked:

@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ import pytest
 from services.client import Client
 from tests.docs.readmes import block
 from tests.end_to_end.conftest import HEIGHT, TILES, WIDTH, png
+from tests.parts.rig import free_port
 from tests.parts.waiting import until
 from workflows.simulation import glass_ball
 
@@ -81,11 +81,6 @@ def url_of(serving: subprocess.Popen[str], folder: Path) -> str:
     while " at http" not in (line := serving.stdout.readline()):
         assert line, (folder / "log").read_text()
     return line.rsplit(" at ", 1)[1].strip()
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        return int(taken.getsockname()[1])
 
 
 def film(show: Path, target: Path) -> None:

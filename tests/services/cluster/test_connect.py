@@ -21,6 +21,7 @@ from services.cluster.connect import connect
 from services.runtime import certificates
 from storage.errors import Unavailable
 from tests.parts.processes import alive
+from tests.parts.rig import free_port
 from tests.parts.waiting import until
 from tests.services.cluster.attempts import answers_without_certificate, gets_in
 from tests.services.cluster.clusters import address, children, listening, started, workers
@@ -79,9 +80,7 @@ def working(folder: Path, at: str, *options: str, **environment: str) -> Iterato
 @pytest.fixture(scope="module")
 def cluster(folder: Path) -> Iterator[Cluster]:
     """Workers that start before their scheduler, and wait for it."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     at = f"tls://127.0.0.1:{port}"
     (folder / "workers.log").touch()
     with working(folder, at, "--workers", str(WORKERS), "--host", "0.0.0.0") as these:
