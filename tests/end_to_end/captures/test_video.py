@@ -2,13 +2,13 @@
 
 import io
 import json
-import time
 import zipfile
 
 import numpy as np
 import pytest
 
 from tests.end_to_end.conftest import HEIGHT, WIDTH, Service, png
+from tests.parts.waiting import until
 from tests.workflows.ingest.video.camera import Camera, capture, film, lights
 from workflows.images import integer_formats
 from workflows.images.tone_curves import to_light
@@ -68,9 +68,8 @@ def test_recording_of_another_program_is_refused(service: Service, scene: Scene,
     made = service.http.post(
         "/v1/captures", content=target.getvalue(), headers={"Content-Type": "application/zip"}
     ).json()
-    while (job := service.http.get(f"/v1/jobs/{made['job']}").json())["state"] in ("queued", "running"):
-        time.sleep(0.05)
+    until(lambda: service.client.job(made["job"]).ended)
+    job = service.client.job(made["job"])
     assert (job["state"], job["problem"]["entry"]) == ("failed", "clip.mp4")
     # the failure is recorded before the data is deleted
-    while any(made["id"] in name for name in service.stored() - before):
-        time.sleep(0.05)
+    until(lambda: not any(made["id"] in name for name in service.stored() - before))

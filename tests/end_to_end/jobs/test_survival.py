@@ -40,8 +40,7 @@ def test_job_continues_after_the_server_is_killed(
     data = tmp_path / "data"
     with serving(data, "--workers", "1") as first:
         job = first.client.recover(first.client.upload(capture_archive)["id"])
-        while first.client.job(job["id"])["tiles"]["done"] < 3:
-            time.sleep(0.01)
+        until(lambda: first.client.job(job["id"])["tiles"]["done"] >= 3)
         family = psutil.Process(first.process.pid).children(recursive=True)
         first.kill()
         _, alive = psutil.wait_procs(family, timeout=300)
@@ -64,8 +63,7 @@ def test_ingest_continues_after_the_server_is_killed(
     # A frame takes 20 kB: a budget of 1 MiB makes slabs of a few frames, and many tiles.
     with serving(data, "--workers", "1", ENVMATTE_INGEST_MEMORY=str(1 << 20)) as first:
         uploaded = first.client.upload(capture_archive)
-        while first.client.job(uploaded["job"])["stage"] == "waiting":
-            time.sleep(0.01)
+        until(lambda: first.client.job(uploaded["job"])["stage"] != "waiting")
         first.kill()
     with serving(data, "--workers", "2", ENVMATTE_INGEST_MEMORY=str(1 << 20)) as second:
         assert second.client.wait(uploaded["job"])["state"] == "succeeded"
@@ -87,8 +85,7 @@ def test_matte_bytes_do_not_depend_on_tiles_or_workers(
 
 def test_cancelled_job_leaves_nothing(service: Service, capture: str) -> None:
     job = service.client.recover(capture)
-    while service.client.job(job["id"])["tiles"]["done"] < 2:
-        time.sleep(0.01)
+    until(lambda: service.client.job(job["id"])["tiles"]["done"] >= 2)
     assert service.client.cancel(job["id"])["state"] == "cancelled"
     with pytest.raises(ServiceError, match="cancelled"):
         service.client.wait(job["id"])
@@ -140,8 +137,7 @@ def test_ingest_that_failed_for_a_passing_reason_can_be_retried(
         first = service.client.upload(capture_archive)
         service.client.wait(first["job"])
         busy = service.client.recover(first["id"], tile=1024)
-        while service.client.job(busy["id"])["stage"] != "recovering":
-            time.sleep(0.01)
+        until(lambda: service.client.job(busy["id"])["stage"] == "recovering")
         time.sleep(0.3)
         second = service.client.upload(capture_archive)
         (part,) = (service.data / "store" / "uploads" / second["id"]).glob("*.part")
@@ -161,8 +157,7 @@ def test_job_cancelled_before_a_kill_leaves_nothing(capture_archive: Path, tmp_p
     data = tmp_path / "data"
     with serving(data, "--workers", "1") as first:
         job = first.client.recover(first.client.upload(capture_archive)["id"])
-        while first.client.job(job["id"])["tiles"]["done"] < 2:
-            time.sleep(0.01)
+        until(lambda: first.client.job(job["id"])["tiles"]["done"] >= 2)
         first.client.cancel(job["id"])
         first.kill()
     (data / "store" / "uploads").mkdir(exist_ok=True)
@@ -178,8 +173,7 @@ def test_job_cancelled_before_a_kill_leaves_nothing(capture_archive: Path, tmp_p
 @pytest.mark.slow
 def test_killed_worker_changes_no_byte(service: Service, matte: str, capture: str) -> None:
     job = service.client.recover(capture)
-    while service.client.job(job["id"])["tiles"]["done"] < 3:
-        time.sleep(0.01)
+    until(lambda: service.client.job(job["id"])["tiles"]["done"] >= 3)
     workers(service.process)[-1].kill()
     ended = service.client.wait(job["id"])
     assert files_of(service, ended["matte"]) == files_of(service, matte)
@@ -208,8 +202,7 @@ def test_failing_tile_fails_its_job_and_retry_continues(
     chunk = service.data / "store" / "captures" / uploaded["id"] / "frames" / "c" / "0" / "0" / "0" / "0"
     data = chunk.read_bytes()
     job = service.client.recover(uploaded["id"])
-    while service.client.job(job["id"])["tiles"]["done"] < 3:
-        time.sleep(0.01)
+    until(lambda: service.client.job(job["id"])["tiles"]["done"] >= 3)
     chunk.unlink()
     with pytest.raises(ServiceError, match="is missing"):
         service.client.wait(job["id"])

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from storage.objects.store import Objects
 from tests.end_to_end.conftest import Service, digests, paused, serving
 from tests.parts.postgres import Server
 from tests.parts.rig import stored
+from tests.parts.waiting import until
 
 pytestmark = pytest.mark.slow
 
@@ -35,8 +35,7 @@ def test_running_job_continues_in_the_restored_backup(
         uploaded = first.client.upload(capture_archive)
         first.client.wait(uploaded["job"])
         job = first.client.recover(uploaded["id"], quality="fast")
-        while tiles_done(first, job["id"]) < 2:
-            time.sleep(0.02)
+        until(lambda: tiles_done(first, job["id"]) >= 2)
         with paused(first):
             made = envmatte("backup", backup, "--data", str(data))
             assert made.returncode == 0, made.stderr
