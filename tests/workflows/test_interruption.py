@@ -6,10 +6,6 @@ from workflows.interruption import checkpoint, interruptible
 from workflows.threads import in_parts
 
 
-def test_nothing_is_checked_unless_somebody_asks() -> None:
-    checkpoint()
-
-
 @pytest.mark.parametrize("threads", [1, 3])
 def test_parts_on_all_threads_end_by_the_check(threads: int) -> None:
     begun: list[int] = []

@@ -109,8 +109,6 @@ def test_errors_do_not_command_the_terminal() -> None:
     "arguments",
     [
         ["fly"],
-        ["status"],
-        ["upload", "no-such-file"],
         ["status", "j", "--url", "localhost:8000"],
         ["status", os.fsdecode(b"not UTF-8: \xe9"), *UNREACHABLE],
         ["worker"],
@@ -131,6 +129,7 @@ def test_exit_code_2_for_a_wrong_command_line(arguments: list[str]) -> None:
         ["list", "jobs", "--name", "glass"],
         ["export", "m", "-o", "glass.html"],
         ["upload", "film.mov"],
+        ["upload", "no-such-file"],
         ["recover"],
         ["recover", "x", "--option", "tile"],
     ],
