@@ -47,7 +47,7 @@ def same(cell: str, value: object) -> bool:
 
 
 @pytest.mark.parametrize("readme", ["README.md", "services/README.md"])
-def test_settings(readme: str) -> None:
+def test_table_of_settings_agrees_with_the_code(readme: str) -> None:
     rows = {
         name: default
         for cell, default, _ in table(readme, "setting", "default", "meaning")
@@ -62,7 +62,7 @@ def test_settings(readme: str) -> None:
         assert plain == expected if value is None else number(plain) == value, name
 
 
-def test_routes(openapi: dict[str, Any]) -> None:
+def test_table_of_routes_agrees_with_the_code(openapi: dict[str, Any]) -> None:
     documented = [
         (method, path)
         for methods, paths, _ in table("services/api/README.md", "method", "path", "does")
@@ -73,7 +73,7 @@ def test_routes(openapi: dict[str, Any]) -> None:
     assert sorted(documented) == sorted(declared)
 
 
-def test_problems() -> None:
+def test_table_of_problems_agrees_with_the_code() -> None:
     documented = [
         (codes(slug)[0], int(status))
         for slug, status, _ in table("services/api/README.md", "slug", "status", "when")
@@ -82,7 +82,7 @@ def test_problems() -> None:
     assert set(documented) == {(slug, int(status)) for status, slug, _ in PROBLEMS.values()}
 
 
-def test_parameters_of_composites(openapi: dict[str, Any]) -> None:
+def test_table_of_parameters_of_composites_agrees_with_the_code(openapi: dict[str, Any]) -> None:
     rows = {
         codes(name)[0]: default
         for name, default, _ in table("workflows/composite/README.md", "parameter", "default", "meaning")
@@ -94,7 +94,7 @@ def test_parameters_of_composites(openapi: dict[str, Any]) -> None:
         assert number(rows[name]) is None if value is None else same(rows[name], value), name
 
 
-def test_options_of_recovery() -> None:
+def test_table_of_options_of_recovery_agrees_with_the_code() -> None:
     documented = [
         (codes(name)[0], (codes(method) or [None])[0], default, values)
         for name, method, default, values in table(
@@ -114,7 +114,7 @@ def test_options_of_recovery() -> None:
             assert [number(end) for end in values.split(" to ")] == [one["minimum"], one["maximum"]], name
 
 
-def test_cost_of_the_quality_fast() -> None:
+def test_cost_of_the_quality_fast_is_that_of_the_results() -> None:
     """The README and the option say what the table of results does."""
     results = {
         method: [[float(figure) for figure in re.findall(r"\d+\.\d", cell)] for cell in cells]
@@ -133,13 +133,13 @@ def test_cost_of_the_quality_fast() -> None:
         assert f"takes four fifths of the time and costs {min(costs):.1f} to {max(costs):.1f} dB" in said
 
 
-def test_commands() -> None:
+def test_table_of_commands_agrees_with_the_code() -> None:
     documented = [codes(name)[0] for name, _ in table("services/cli/README.md", "command", "does")]
     assert sorted(documented) == sorted(f"envmatte {name}" for name in _commands(main))
 
 
 @pytest.mark.parametrize("readme", ["README.md", "workflows/programs/README.md"])
-def test_presets(readme: str) -> None:
+def test_table_of_presets_agrees_with_the_code(readme: str) -> None:
     found = {}
     for names, frames, _ in table(readme, "preset", "frames", "use it for"):
         colour = "rgb" if "in colour" in frames else "grey"
@@ -150,7 +150,7 @@ def test_presets(readme: str) -> None:
     assert found == {name: (preset(name).count, RECIPES[name].colour) for name in RECIPES}
 
 
-def test_the_example_of_a_capture() -> None:
+def test_example_of_a_capture_is_valid() -> None:
     assert json.loads(block("workflows/ingest/README.md", "The capture format", "json")) == EXAMPLE
 
 

@@ -81,7 +81,7 @@ def test_capture_from_several_patches(service: Service, capture_archive: Path) -
     check_problem(service.http.post("/v1/captures", json=body), 404, "not-found")
 
 
-def test_creation_with_upload(service: Service) -> None:
+def test_creation_may_have_the_first_bytes(service: Service) -> None:
     headers = CHUNK | {"Upload-Length": "10"}
     answer = service.http.post("/v1/uploads", headers=headers, content=b"12345")
     assert (answer.status_code, answer.headers["upload-offset"]) == (201, "5")
@@ -96,7 +96,7 @@ def test_creation_with_upload(service: Service) -> None:
     check_problem(answer, 413, "too-large")
 
 
-def test_method_override(service: Service) -> None:
+def test_method_may_be_overridden(service: Service) -> None:
     where = create(service, 3)
     headers = CHUNK | {"Upload-Offset": "0", "X-HTTP-Method-Override": "PATCH"}
     assert service.http.post(where, headers=headers, content=b"abc").status_code == 204

@@ -68,7 +68,7 @@ def test_exr_backdrop_gives_exr_composite(service: Service, matte: str) -> None:
     assert deep.dtype == np.uint16
 
 
-def test_crop_and_preview(service: Service, matte: str) -> None:
+def test_crop_and_preview_are_of_the_whole(service: Service, matte: str) -> None:
     whole = decoded(post_composite(service, matte))
     crop = decoded(post_composite(service, matte, x=10, y=20, width=31, height=17))
     np.testing.assert_array_equal(crop, whole[20:37, 10:41])
@@ -78,7 +78,7 @@ def test_crop_and_preview(service: Service, matte: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["image/png", "image/jpeg", "image/x-exr"])
-def test_twice_the_size(service: Service, matte: str, kind: str) -> None:
+def test_twice_the_size_shows_the_same(service: Service, matte: str, kind: str) -> None:
     def read(answer: httpx2.Response) -> np.ndarray:
         if kind == "image/x-exr":
             return float_formats.decode(answer.content, memory=1 << 24)[..., :3]
@@ -136,7 +136,7 @@ def test_invalid_query_is_refused(service: Service, matte: str, query: dict[str,
     assert check_problem(post_composite(service, matte, **query), 422, "bad-request")["field"] in query
 
 
-def test_moved_backdrop(service: Service, matte: str) -> None:
+def test_moved_backdrop_is_one_drawn_elsewhere(service: Service, matte: str) -> None:
     half = np.zeros_like(BACKDROP)
     half[:, 80:] = BACKDROP[:, :80]
     moved = decoded(post_composite(service, matte, right=0.5)).astype(int)
@@ -145,7 +145,7 @@ def test_moved_backdrop(service: Service, matte: str) -> None:
     assert np.abs(moved - decoded(post_composite(service, matte))).mean() > 10
 
 
-def test_backdrop_at_another_depth(service: Service, matte: str) -> None:
+def test_backdrop_at_another_depth_moves_the_glass(service: Service, matte: str) -> None:
     still = decoded(post_composite(service, matte)).astype(int)
     depths = {"distance": 3, "camera": 5}
     same = decoded(post_composite(service, matte, depth=3, **depths)).astype(int)

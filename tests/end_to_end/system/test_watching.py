@@ -119,7 +119,7 @@ def test_metrics_count_the_jobs(watched: Watched) -> None:
     assert found[("envmatte_coordinator_last_sign_seconds",)] < SILENCE
 
 
-def test_openmetrics_on_request(watched: Watched) -> None:
+def test_openmetrics_are_sent_on_request(watched: Watched) -> None:
     headers = {"accept": "application/openmetrics-text; version=1.0.0"}
     answer = watched.service.http.get("/metrics", headers=headers)
     assert answer.headers["content-type"].startswith("application/openmetrics-text")
@@ -137,7 +137,7 @@ def test_metrics_count_uploads_and_queued_tiles(watched: Watched) -> None:
     assert _figures(http.get("/metrics").text)[("envmatte_uploads",)] == 0
 
 
-def test_cluster_status(watched: Watched) -> None:
+def test_cluster_status_names_workers_coordinator_and_queue(watched: Watched) -> None:
     http = watched.service.http
     until(lambda: http.get("/v1/cluster").json()["queue"]["tiles_under_way"] == 0)
     found = http.get("/v1/cluster").json()

@@ -82,7 +82,7 @@ def test_object_whose_checksums_cannot_be_written_is_not_kept(
         objects.read("a")
 
 
-def test_listing_and_deleting(objects: Objects, folder: Path) -> None:
+def test_deleted_folders_and_files_are_listed_no_more(objects: Objects, folder: Path) -> None:
     for path in ("c/1/x", "c/1/deep/y", "c/2/x", "c/10/x", "c/file"):
         stream(objects, path, b"data")
     assert objects.names("c") == ["1", "10", "2", "file"]
@@ -133,7 +133,7 @@ def test_folder_is_created_and_reopened(objects: Objects, folder: Path) -> None:
     assert again.read("a").read() == b"1"
 
 
-def test_missing_group_and_array(objects: Objects) -> None:
+def test_missing_group_or_array_is_not_found(objects: Objects) -> None:
     with pytest.raises(FileNotFoundError):
         gather(objects.group("captures/none"))
     with pytest.raises(FileNotFoundError):

@@ -71,7 +71,7 @@ def test_ending_unknown_job_changes_nothing(connection: Connection) -> None:
     assert not jobs.end(connection, "none", "failed")
 
 
-def test_cancel(connection: Connection) -> None:
+def test_job_is_cancelled_once_and_not_after_its_end(connection: Connection) -> None:
     job = planned(connection)
     jobs.cancel(connection, job)
     jobs.cancel(connection, job)

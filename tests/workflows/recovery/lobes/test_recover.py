@@ -82,7 +82,7 @@ def part_of(photometry, part):
         pytest.param((1.0, 30.0, 1.0, 1.0), id="at the edge"),
     ],
 )
-def test_one_lobe(request, colours, shape, truth, observe):
+def test_one_lobe_is_found(request, colours, shape, truth, observe):
     shown, T = request.getfixturevalue(colours), truth(shape)
     T_found = dense(shown, recovered(shown, observe(shown, T)).transport)
     assert np.abs(T_found - T).sum(axis=2).max() < 0.35
@@ -95,7 +95,7 @@ def test_one_lobe(request, colours, shape, truth, observe):
 
 
 @pytest.mark.parametrize("colours", ["patterns", "coloured"])
-def test_two_lobes(request, colours, truth, observe):
+def test_two_lobes_are_found_with_their_shares(request, colours, truth, observe):
     shown = request.getfixturevalue(colours)
     one, two = truth((14.6, 30.2, 1.5, 1.0, 0.3)), truth((45.3, 16.7, 2.0, 1.5, 1.0))
     T = 0.65 * one + 0.35 * two
@@ -263,7 +263,7 @@ def test_least_weight_bounds_the_kept_weights(patterns, truth, observe, least):
 
 
 @pytest.mark.parametrize("colours", ["patterns", "coloured"])
-def test_dark_channels(request, colours, truth, observe):
+def test_dark_channels_have_no_row(request, colours, truth, observe):
     shown, T = request.getfixturevalue(colours), truth(*[(25.3, 18.6, 3.0, 1.0, 0.6)] * 3)
     scene = observe(shown, T, rho=[[0.7, 0.002, 0.0], [0.0, 0.0, 0.0], [0.0, 0.7, 0.7]])
     found = recovered(shown, scene)
@@ -278,7 +278,7 @@ def test_dark_channels(request, colours, truth, observe):
 
 
 @pytest.mark.parametrize("n", [0, 2])
-def test_nothing_to_recover(patterns, coloured, truth, observe, n):
+def test_without_light_there_are_no_rows(patterns, coloured, truth, observe, n):
     for shown in (patterns, coloured):
         T = truth((20, 20, 1, 1), (30, 20, 1, 1))[:n]
         found = recovered(shown, observe(shown, T, rho=0.0))
@@ -321,7 +321,7 @@ def test_bad_input_gives_finite_rows(spoil, request, colours, varied, observe):
         assert np.isfinite(found.photometry.rho[sane]).all()
 
 
-def test_patterns_shown_twice(patterns, truth, observe):
+def test_patterns_shown_twice_or_all_alike_are_taken(patterns, truth, observe):
     twice = Patterns(patterns.pyramid, 1, np.tile(patterns.code, 2))
     T = truth((25.3, 18.6, 3.0, 1.0, 0.6))
     found = recovered(twice, observe(twice, T)).transport
@@ -333,7 +333,7 @@ def test_patterns_shown_twice(patterns, truth, observe):
 
 
 @pytest.mark.parametrize("light", [0, 128, 255])
-def test_patterns_that_are_constant(patterns, truth, observe, light):
+def test_patterns_that_are_constant_give_finite_rows(patterns, truth, observe, light):
     flat = Patterns(patterns.pyramid, 1, np.full((patterns.pyramid.nodes, 10), light, np.uint8))
     found = recovered(flat, observe(flat, truth((25.3, 18.6, 3.0, 1.0)))).transport
     assert np.isfinite(found.weight).all()
@@ -341,7 +341,7 @@ def test_patterns_that_are_constant(patterns, truth, observe, light):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_few_patterns(patterns_of, truth, observe, count):
+def test_few_patterns_give_finite_rows(patterns_of, truth, observe, count):
     few = patterns_of([(COLUMNS, ROWS, count)], 3)
     T = truth((25.3, 18.6, 3.0, 1.0, 0.6), (1, 1, 1, 1))
     found = recovered(few, observe(few, T))
@@ -350,7 +350,7 @@ def test_few_patterns(patterns_of, truth, observe, count):
     np.testing.assert_allclose(found.photometry.rho, 0.7, atol=0.02)
 
 
-def test_a_pyramid_of_one_grid(patterns_of, gaussian, observe):
+def test_a_pyramid_of_one_grid_suffices(patterns_of, gaussian, observe):
     small = patterns_of([(8, 6, 20), (16, 12, 40)], 4)
     assert len(small.pyramid.grids) == 1
     T = gaussian(16, 12, 7.3, 5.6, 1.0, 0.8, 0.4)
