@@ -1,6 +1,5 @@
 """A service survives kills, cancelled jobs and a second service, and its mattes stay the same to the byte."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -240,21 +239,3 @@ def test_second_service_on_the_same_folder_is_refused(service: Service) -> None:
     assert "serves" in second.stderr
     assert "already" in second.stderr
     assert service.http.get("/healthz").status_code == 200
-
-
-def test_public_address_without_keys_is_refused(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "services",
-        "serve",
-        "--data",
-        str(tmp_path / "data"),
-        "--host",
-        "0.0.0.0",
-    ]
-    environment = {name: value for name, value in os.environ.items() if name != "ENVMATTE_KEYS"}
-    refused = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
-    assert refused.returncode == 2
-    assert "envmatte keys make" in refused.stderr
-    assert "ENVMATTE_KEYS" in refused.stderr

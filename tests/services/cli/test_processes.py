@@ -52,6 +52,13 @@ def test_exit_code_4_and_no_data_folder_if_the_port_is_taken(tmp_path: Path) -> 
     assert "Traceback" not in found.stderr
 
 
+def test_exit_code_2_if_others_could_reach_a_service_without_keys(tmp_path: Path) -> None:
+    found = envmatte("serve", "--data", str(tmp_path / "data"), "--host", "0.0.0.0", ENVMATTE_KEYS="")
+    assert (found.returncode, found.stdout) == (2, "")
+    assert "envmatte keys make" in found.stderr
+    assert "ENVMATTE_KEYS" in found.stderr
+
+
 @pytest.mark.parametrize("command", ["serve", "coordinator", "worker", "warm"])
 def test_command_without_a_folder_for_kernels_asks_for_one(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
