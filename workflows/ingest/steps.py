@@ -264,7 +264,7 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
     objects.sweep(captures.path(task.capture))
     stack = Stack(objects, task.capture)
     border = BorderValues.of(stack)
-    check_frames(stack)
+    check_frames(stack, border)
     calibrate(stack, border)
     seconds = _try_out(stack, border)
     survey(stack, border)

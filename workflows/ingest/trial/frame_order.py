@@ -6,10 +6,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
-from storage.layout.captures import Stack, thumbnail_mask
+from storage.layout.captures import Stack, thumbnail_edge, thumbnail_mask
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
+from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.measured_light import exposures_of
 from workflows.ingest.video.resemblance import GRIDS, MIN_PATTERNS, coarse_light
 from workflows.programs.parts import Bernoulli
@@ -86,8 +88,10 @@ class Order(NamedTuple):
         return np.clip(patterns + self.by * later, 0, len(patterns) - 1)
 
 
-def check_frames(stack: Stack) -> None:
+def check_frames(stack: Stack, border: BorderValues | None) -> None:
     """Find the frames that do not show their patterns, and annotate the stack with them.
+
+    Blocks that see the border of a film, which differs from frame to frame, are left out.
 
     ``odd_frames`` are single ones of random patterns, as with a hand in the picture, a flash, or a still in the place
     of another: recovery does without them. ``order`` has the attributes of an `Order` if the frames are in another one.
@@ -103,7 +107,7 @@ def check_frames(stack: Stack) -> None:
     """
     stack.annotate(odd_frames=[], order=None, constants_apart=None)
     program = Program.model_validate(stack.attributes["program"])
-    light = _light_of(stack)
+    light = _light_of(stack, border)
     if light is None:
         return
     stated = np.array(stack.attributes["patterns"])
@@ -242,12 +246,17 @@ def _constants_apart(seen: Floats, ends: tuple[Integers, Integers]) -> tuple[Int
     return ends[int(np.argmax(shares))], max(shares)
 
 
-def _light_of(stack: Stack) -> Floats | None:
-    """The approximate light of blocks that are to be recovered and see the monitor, (frames, n)."""
+def _light_of(stack: Stack, border: BorderValues | None) -> Floats | None:
+    """The approximate light of blocks that are to be recovered and see the patterns, (frames, n)."""
     thumbnails = stack.thumbnails()
     if thumbnails is None:
         return None
-    codes = thumbnails[:, thumbnail_mask(stack.mask())]
+    wanted = thumbnail_mask(stack.mask())
+    if border is not None:
+        of_border = np.zeros_like(wanted)
+        of_border[tuple(border.places // thumbnail_edge(stack.height, stack.width))] = True
+        wanted &= ~binary_dilation(of_border, np.ones((3, 3), bool))  # those beside see a part of it
+    codes = thumbnails[:, wanted]
     light = to_light(codes.astype(np.float32) / np.float32(65535), _curve(stack.attributes["response"]))
     changes = light.std(axis=0)
     light = light[:, changes > CHANGES * np.quantile(changes, BRIGHTEST)]

@@ -1,8 +1,10 @@
 """Frames that do not show the patterns that they are said to: in another order, doubled, with a hand or a flash."""
 
+import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -21,8 +23,10 @@ from workflows.ingest.report.report import Report, report
 from workflows.ingest.trial.frame_order import check_frames
 from workflows.jobs import Task, run
 from workflows.mattes.steps import STEPS
+from workflows.programs.files import fit_to_screen
 from workflows.programs.presets import preset
 from workflows.programs.program import Program
+from workflows.programs.video import write_video
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import Scene
 from workflows.untrusted.limits import Limits
@@ -75,7 +79,7 @@ def stills(scene: Scene) -> list[Codes]:
 
 def found(stills: Sequence[Codes], scene: Scene) -> dict[str, Any]:
     frames = Frames(stills, scene.object_mask)
-    check_frames(cast(Stack, frames))
+    check_frames(cast(Stack, frames), None)
     return {name: frames.attributes[name] for name in ("odd_frames", "order", "constants_apart")}
 
 
@@ -177,7 +181,7 @@ def test_longer_exposures_of_an_odd_frame_are_odd(stills: list[Codes], scene: Sc
         "patterns": np.repeat(np.arange(COUNT), 2).tolist(),
         "exposures": list(exposures) * COUNT,
     }
-    check_frames(cast(Stack, frames))
+    check_frames(cast(Stack, frames), None)
     assert frames.attributes["odd_frames"] == list(range(2 * MIDDLE, 2 * MIDDLE + 4))
 
 
@@ -187,6 +191,17 @@ def test_light_that_is_switched_on_makes_black_frames_differ(stills: list[Codes]
     assert apart["share"] > 0.5
     numbers, sent = PROGRAM.constants
     assert len({tuple(sent[numbers == n][0].tolist()) for n in apart["frames"]}) == 1
+
+
+def test_border_of_a_film_is_no_light_that_changes(
+    ingest: Callable[..., Stack], make_zip: Callable[..., bytes], tmp_path: Path
+) -> None:
+    film = tmp_path / "film.mp4"
+    write_video(fit_to_screen("sketch", (320, 240), bordered=True), film, 2.0, lambda done, of: None)
+    manifest = json.loads(film.with_suffix(".json").read_text())
+    stack = ingest("c", make_zip(manifest, {film.name: film.read_bytes()}))
+    assert stack.attributes["border"]
+    assert stack.attributes["constants_apart"] is None
 
 
 def archive(stills: Sequence[Codes], scene: Scene, program: Program = PROGRAM) -> bytes:
