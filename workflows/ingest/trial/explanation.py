@@ -49,7 +49,7 @@ def explain(
     Returns
     -------
     Explained or None
-        None if the sample has too little contrast.
+        None if the sample has too little contrast, or every measurement of it is clipped.
     """
     # The bare monitor tells what a camera does better than glass, whose T explains some of it.
     wide = sample if stack.mask().all() else take_sample(stack, masked=False) or sample

@@ -82,7 +82,7 @@ def find_unexplained(
     Returns
     -------
     Unexplained or None
-        None if the sample has too little contrast.
+        None if the sample has too little contrast, or every measurement of it is clipped.
 
     Notes
     -----
@@ -107,6 +107,8 @@ def find_unexplained(
         if found is None:
             return None
         rest = Rest(capture, found, patterns, through, spreads, noise)
+        if not rest.known.any():
+            return None
         last = shares
         shares = rest.shares(error)
         if not LEAST <= shares.sum() <= MOST_GLARE:

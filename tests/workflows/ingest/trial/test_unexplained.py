@@ -12,6 +12,7 @@ from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
 from workflows.ingest.measured_light import monitor_curve_of
 from workflows.ingest.report.expected_psnr import model_error_of
+from workflows.ingest.report.report import report
 from workflows.ingest.trial import unexplained
 from workflows.ingest.trial.trial_recovery import Calibrated, take_sample
 from workflows.programs.parts import Constant
@@ -85,6 +86,17 @@ def test_glare_is_measured(scene: Scene, program: Program, ingest: Ingest) -> No
     shares = ingest("c", filmed(scene, program, glare=0.1)).attributes["glare"]
     assert sum(shares) == pytest.approx(0.1, abs=0.025)
     assert shares[1] > 0.06
+
+
+def test_frames_of_black_and_white_alone_promise_nothing(
+    scene: Scene, program: Program, ingest: Ingest
+) -> None:
+    def see(_: int, picture: NDArray[np.uint8]) -> NDArray[np.floating]:
+        return np.where(scene.composite(to_light(picture, "srgb")) > 0.5, 1.0, 0.0)
+
+    stack = ingest("c", captured(program, see))
+    assert stack.attributes["pattern_error"] is None
+    assert not any("nan" in finding.message for finding in report(stack.attributes, stack.frames).findings)
 
 
 def test_shares_that_no_glare_has_are_left_out(
