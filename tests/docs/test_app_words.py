@@ -5,8 +5,13 @@ import json
 import re
 from collections import Counter
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+
+from workflows.composite.video import steps as video_steps
+from workflows.ingest import steps as ingest_steps
+from workflows.mattes import steps as matte_steps
 
 WEB = Path(__file__).parents[2] / "services" / "web"
 WORDS = sorted((WEB / "app" / "words").glob("*.js"))
@@ -143,6 +148,12 @@ def test_pages_have_no_words_of_their_own(path: Path) -> None:
     shown = [one.strip() for one in re.findall(r">([^<>]+)<", text)]
     assert [one for one in shown if re.search("[A-Za-z]", one) and one != "envmatte" and "$" not in one] == []
     assert re.findall(r'(?:aria-label|title|placeholder)="', text) == []
+
+
+@pytest.mark.parametrize("steps", [ingest_steps, matte_steps, video_steps], ids=lambda one: one.STEPS.kind)
+def test_stage_of_a_job_has_words(steps: ModuleType) -> None:
+    assert f"stage.{steps.STEPS.stage}" in ENGLISH
+    assert all(steps.STEPS.stage in words(path) for path in OF_SERVICE)  # for the log
 
 
 def literals(path: Path, *, with_docstrings: bool = False) -> list[str]:
