@@ -50,8 +50,9 @@ def test_film_with_its_manifest_becomes_a_capture(desk: Page, service: Service, 
     desk.goto(f"{service.url}/#/captures")
     desk.get_by_label(ZIP).set_input_files(clip)
     field = desk.get_by_label("Or the capture.json that came with the program")
-    field.set_input_files({"name": "holiday.json", "mimeType": "application/json", "buffer": b"{}"})
-    expect(desk.get_by_text("Not the right capture.json: it describes no video")).to_be_visible()
+    for wrong, reason in ((b"<holiday>", "it is not JSON"), (b"null", "it describes no video")):
+        field.set_input_files({"name": "holiday.json", "mimeType": "application/json", "buffer": wrong})
+        expect(desk.get_by_text(f"Not the right capture.json: {reason}.")).to_be_visible()
     field.set_input_files(clip.with_suffix(".json"))
     expect(desk.get_by_role("heading", name="IMG 0001")).to_be_visible(timeout=MINUTE)
     expect(desk.get_by_role("region", name="Report")).to_be_visible(timeout=2 * MINUTE)

@@ -76,6 +76,15 @@ export async function stillsArchive({ stills }, { video, mask, ...manifest }, si
 	return zip([["capture.json", new Blob([text])], ...frames.map(({ file }, n) => [file, stills[n]])], signal);
 }
 
+// What JSON says; the browser's own errors are in its language, and for programmers.
+function parsed(text) {
+	try {
+		return JSON.parse(text);
+	} catch {
+		throw new Error(t("manifest.nojson"));
+	}
+}
+
 // Asks in `where` which program a film or stills show; resolves with their capture.json.
 export async function askForManifest(where, isFilmed, signal) {
 	const { programs } = await getJson("v1/programs?limit=100", signal);
@@ -90,9 +99,9 @@ export async function askForManifest(where, isFilmed, signal) {
 		const own = h("input", { type: "file", accept: ".json,application/json" });
 		own.onchange = async () => {
 			try {
-				const found = JSON.parse(await own.files[0].text());
-				if (isFilmed && !found.video?.patterns_per_second) throw new Error(t("manifest.novideo"));
-				if (!found.program?.parts) throw new Error(t("manifest.noprogram"));
+				const found = parsed(await own.files[0].text());
+				if (isFilmed && !found?.video?.patterns_per_second) throw new Error(t("manifest.novideo"));
+				if (!found?.program?.parts) throw new Error(t("manifest.noprogram"));
 				resolve(found);
 			} catch (error) {
 				problem.textContent = t("manifest.wrong", { why: error.message });

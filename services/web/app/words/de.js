@@ -202,6 +202,7 @@ export const de = {
 	"lock.whiteBalanceMode": "Weißabgleich",
 	"log": "Protokoll",
 	"made": "Erstellt",
+	"manifest.nojson": "sie ist kein JSON",
 	"manifest.noprogram": "sie beschreibt kein Programm",
 	"manifest.novideo": "sie beschreibt kein Video",
 	"manifest.wrong": "Nicht die richtige capture.json: {why}. Gebraucht wird die, die mit dem Programm kam.",

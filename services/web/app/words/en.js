@@ -202,6 +202,7 @@ export const en = {
 	"lock.whiteBalanceMode": "white balance",
 	"log": "Log",
 	"made": "Made",
+	"manifest.nojson": "it is not JSON",
 	"manifest.noprogram": "it describes no program",
 	"manifest.novideo": "it describes no video",
 	"manifest.wrong": "Not the right capture.json: {why}. Choose the one that came with the program.",
