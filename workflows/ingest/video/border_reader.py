@@ -1,6 +1,7 @@
 """Find the display in a recording, and the frames of each pattern by the numbers in its border."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ _CONTRAST = 0.15  # least contrast of a pixel of the sides, as a share of the fr
 _WITHIN = (0.3, 0.5, 0.7)  # where a cell is sampled, along each axis
 _SIMPLEX = 1.0  # pixels: the first step of the search for the corners
 _IN_ORDER = 0.5  # of the plateaus with numbers, this share must be in order
+_BEYOND = 3  # numbers that a program does not have, from which on another one was shown
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -88,10 +90,12 @@ def find_by_numbers(
         upright = np.rot90(codes, quarters, axes=(1, 2))
         parts = (_LIGHT[upright[at : at + BATCH]] for at in range(0, len(upright), BATCH))
         numbers = np.concatenate([_numbers(part, homography, border) for part in parts])
+        longer = _longer(numbers, patterns)
         numbers[numbers >= patterns] = LEAD
         row = _ascending(numbers)
         if len(row) >= max(MIN_PLATEAUS, _IN_ORDER * np.count_nonzero(numbers > LEAD)):
-            return _found(recording, {int(there[at]): int(numbers[at]) for at in row}, patterns)
+            found = _found(recording, {int(there[at]): int(numbers[at]) for at in row}, patterns)
+            return replace(found, longer=longer)
     return None
 
 
@@ -217,6 +221,14 @@ def _ascending(numbers: NDArray[np.intp]) -> list[int]:
         row.append(last)
         last = before[last]
     return row[::-1]
+
+
+def _longer(numbers: NDArray[np.intp], patterns: int) -> int:
+    """How many patterns are numbered at least, if these are more than there should be, and not a few misreadings."""
+    seen = np.unique(numbers[_ascending(numbers)])
+    beyond = seen[seen >= patterns]
+    count = int(beyond.max(initial=0)) + 1
+    return count if beyond.size >= max(_BEYOND, (count - patterns) / 2) else 0
 
 
 def _found(recording: Recording, seen: dict[int, int], patterns: int) -> FoundPatterns:

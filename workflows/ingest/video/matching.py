@@ -129,6 +129,11 @@ def match_frames(
     recording = Recording(signatures, (ticks - ticks[0]) * tick, 1 / expected.rate)
     found = find_by_numbers(recording, large, border, program.count) if border is not None else None
     numbered = found is not None
+    if found is not None and found.longer:
+        raise expected.refusal(
+            f"it shows a program of {found.longer} patterns or more, by the numbers in its border, but that of "
+            f"capture.json has {program.count}: choose the program that was shown"
+        )
     if found is None:
         found = _by_timing(recording, expected)
     looks, score, odd = _compare(recording, found, expected)

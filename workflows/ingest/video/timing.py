@@ -33,6 +33,8 @@ class FoundPatterns:
     jumps : bool
         Whether there was not enough time somewhere for the patterns that must have passed: part of the recording is
         cut out, or the match is wrong.
+    longer : int
+        Patterns of the program that was shown, at least, if its border numbers more of them than there should be.
     """
 
     frames: list[Integers]
@@ -42,6 +44,7 @@ class FoundPatterns:
     rate: float
     cost: float
     jumps: bool
+    longer: int = 0
 
 
 def find_by_timing(

@@ -140,6 +140,13 @@ def test_unfinished_film_has_the_patterns_that_were_shown(ingest_film: Callable[
     assert misplaced(stack, made, numbers) == []
 
 
+def test_film_of_a_longer_program_is_refused(ingest_film: Callable[..., Any]) -> None:
+    program = preset("sketch", *BORDER.inner[2:])
+    shorter = program.model_copy(update={"parts": program.parts[:-2]})
+    with pytest.raises(CaptureError, match=r"program of 37 patterns or more, .* has 32: choose the program"):
+        ingest_film(Camera(hold=HOLD), program=shorter.model_dump(mode="json"))
+
+
 @pytest.mark.exhaustive
 @pytest.mark.slow
 def test_cut_film_lacks_only_the_patterns_cut_out(ingest_film: Callable[..., Any]) -> None:

@@ -129,6 +129,7 @@ export const de = {
 	"it looks unlike others of its kind, as if something had been in front": "es sieht anders aus als andere seiner Art, als wäre etwas davor gewesen",
 	"it makes no difference to black and white": "für Schwarz und Weiß ist sie ohne Belang",
 	"it shares the workers, {workers} in all, with other jobs: {jobs}": "er teilt sich die Worker, insgesamt {workers}, mit anderen Aufträgen: {jobs}",
+	"it shows a program of {patterns} patterns or more, by the numbers in its border, but that of capture.json has {count}: choose the program that was shown": "er zeigt nach den Zahlen in seinem Rand ein Programm von {patterns} oder mehr Mustern, das in capture.json aber hat {count}: das gezeigte Programm wählen",
 	"it unpacks to {found} bytes in place of {size}": "ausgepackt sind es {found} Bytes statt {size}",
 	"its capture {id} is being ingested": "seine Aufnahme {id} wird eingelesen",
 	"its checksum does not match": "die Prüfsumme stimmt nicht",
