@@ -103,6 +103,15 @@ class Nodes:
         source = Template((_KERNELS / f"{kernel}.blink").read_text()).substitute(params)
         return self.add("BlinkScript", inputs, name=name, kernelSource=_quoted(source))
 
+    def grid(self, name: str, size: tuple[int, int], u: str, v: str) -> str:
+        """Add what has places (u, v), expressions of x and y, in the pixels of a picture of a size."""
+        canvas = self.add("Constant", name=f"{name}_canvas", format=_format(size))
+        return self.add("Expression", (canvas,), name=name, expr0=u, expr1=v)
+
+    def look_up(self, name: str, image: str, places: str, filter: str) -> str:
+        """Add what an image shows at places."""
+        return self.add("STMap", (image, places), name=name, channels="rgb", uv="rgb", filter=filter)
+
     def plus(self, name: str, one: str | None, other: str) -> str:
         """Add the sum of two nodes, the first of which may be missing."""
         return self.add("Merge2", (one, other), name=name, operation="plus") if one else other
@@ -125,9 +134,8 @@ class Nodes:
             f"({a:.9g}*x+{b:.9g}*y+{c:.9g})" for a, b, c in plate.place @ np.array(to_shares)
         )
         u, v = f'"clamp({across}/{depth},0,1)"', f'"clamp(1-{down}/{depth},0,1)"'
-        canvas = self.add("Constant", name="monitor", format=_format((wide, high)))
-        place = self.add("Expression", (canvas,), name="where", expr0=u, expr1=v)
-        return self.add("STMap", (backdrop, place), name="shown", channels="rgb", uv="rgb", filter="Cubic")
+        place = self.grid("monitor", (wide, high), u, v)
+        return self.look_up("shown", backdrop, place, "Cubic")
 
     def finish(self, matte: Matte, held: str, arrived: str, plate: Plate | None) -> None:
         """Add what makes the glass of the light that arrives, and the group's output."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
 Image = NDArray[np.float32]
 CLASSES = {
@@ -126,17 +126,18 @@ def _run(
             source, places = (np.asarray(one) for one in of)
             assert node.knobs["uv"] == "rgb"
             v, u = (places[..., c] * source.shape[1 - c] - 0.5 for c in (1, 0))
-            order = {"Impulse": 0, "Cubic": 3}[node.knobs["filter"]]
-            planes = [
-                map_coordinates(plane, (v, u), order=order, mode="nearest")
-                for plane in np.moveaxis(source, -1, 0)
-            ]
-            return np.stack(planes, axis=-1)
+            interpolate = {"Impulse": _nearest, "Cubic": _smooth}[node.knobs["filter"]]
+            return interpolate(source, v, u)
         case "Expression":
             (image,) = (np.array(one) for one in of)
             y, x = np.mgrid[: image.shape[0], : image.shape[1]]
-            for c in range(2):
-                image[..., c] = _value(node.knobs[f"expr{c}"].strip('"'), {"x": x, "y": y})
+            known = {c: image[..., n].astype(float) for n, c in enumerate("rgb")} | {"x": x, "y": y}
+            for n in range(4):
+                if name := node.knobs.get(f"temp_name{n}"):
+                    known[name] = _value(node.knobs[f"temp_expr{n}"].strip('"'), known)
+            for c in range(3):
+                if expression := node.knobs.get(f"expr{c}"):
+                    image[..., c] = _value(expression.strip('"'), known)
             return image
         case "MergeExpression":
             below, above = (np.asarray(one) for one in of)
@@ -164,8 +165,30 @@ def _run(
 
 def _value(expression: str, known: dict[str, Any]) -> Any:
     """The value of an expression of Nuke's; these are also Python."""
-    functions = {"abs": np.abs, "max": np.maximum, "sqrt": np.sqrt, "pow": np.power, "clamp": np.clip}
+    functions = {"max": np.maximum, "min": np.minimum, "clamp": np.clip, "floor": np.floor}
+    functions |= {"sqrt": np.sqrt, "pow": np.power}
     return eval(expression, {"__builtins__": {}}, functions | known)
+
+
+def _nearest(image: Image, y: NDArray[np.floating], x: NDArray[np.floating]) -> Image:
+    """The pixels that places lie in, counted from the centre of the first; edges are repeated."""
+    rows, columns = (
+        np.clip(np.floor(at + 0.5), 0, n - 1) for at, n in zip((y, x), image.shape[:2], strict=True)
+    )
+    return np.asarray(image[rows.astype(int), columns.astype(int)])
+
+
+def _smooth(image: Image, y: NDArray[np.floating], x: NDArray[np.floating]) -> Image:
+    """Between pixels as Natron's twin of the filter Cubic goes: by ``f^2 (3 - 2 f)`` at a fraction f."""
+    near = [(np.floor(at), at - np.floor(at)) for at in (y, x)]
+    seen = np.zeros((*y.shape, image.shape[2]))
+    for corner in np.ndindex(2, 2):
+        share = np.prod(
+            [np.abs(1 - i - f * f * (3 - 2 * f)) for i, (_, f) in zip(corner, near, strict=True)], axis=0
+        )
+        at = (first + i for i, (first, _) in zip(corner, near, strict=True))
+        seen += share[..., np.newaxis] * _nearest(image, *at)
+    return seen.astype(np.float32)
 
 
 def _run_kernel(source: str, images: list[Image], at: Path) -> Image:

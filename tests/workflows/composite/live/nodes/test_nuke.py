@@ -107,20 +107,22 @@ def test_nodes_without_kernels(objects: Objects, tmp_path: Path) -> None:
     assert group.knobs["name"] == "envmatte_glass_stmap"
     by_name = {node.knobs["name"]: node for node in nodes}
     assert len(by_name) == len(nodes)
-    assert {node.kind for node in nodes} < CLASSES.keys() - {"BlinkScript", "Group"}
+    assert {node.kind for node in nodes} <= CLASSES.keys() - {"BlinkScript", "Group"}
     assert all(len(node.inputs) == CLASSES[node.kind] for node in nodes)
 
     def inputs(name: str) -> list[str]:
         return [one.knobs["name"] for one in by_name[name].inputs]
 
     levels = [node for node in nodes if node.kind == "Blur"]
-    assert [node.knobs["name"] for node in levels] == ["level0", "level1", "level2"]
+    assert [node.knobs["name"] for node in levels] == ["blur0", "blur1", "blur2"]
     assert {inputs(node.knobs["name"])[0] for node in levels} == {"whole"}
     assert by_name["whole"].knobs["crop"] == "false"  # edges repeated, rather than black
     for k in range(2):
+        assert inputs(f"place{k}") == [f"lookup{k}"]
         for n in range(3):
-            assert inputs(f"look{k}_{n}") == [f"level{n}", f"lookup{k}"]
-            assert inputs(f"share{k}_{n}") == [f"lookup{k}", f"look{k}_{n}"]
+            assert inputs(f"level{n}") == [f"blur{n}", "halves"]
+            assert inputs(f"look{k}_{n}") == [f"level{n}", f"place{k}"]
+            assert inputs(f"share{k}_{n}") == [f"place{k}", f"look{k}_{n}"]
         assert inputs(f"seen{k}_1") == [f"share{k}_0", f"share{k}_1"]
         assert inputs(f"seen{k}_2") == [f"seen{k}_1", f"share{k}_2"]
         assert inputs(f"lit{k}") == [f"weight{k}", f"seen{k}_2"]
@@ -133,7 +135,7 @@ def test_nodes_without_kernels(objects: Objects, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["lens", "ball", "tumbler"])
 def test_blurs_draw_nearly_the_composite(objects: Objects, tmp_path: Path, name: str) -> None:
     found = measure_blurs(recovered(objects, name), tmp_path, LOOKUPS)
-    least = {"photo": 44, "strokes": 44, "ramp": 70, "tiles": 37, "checker": 36}
+    least = {"photo": 49, "strokes": 49, "ramp": 78, "tiles": 41, "checker": 39.5}
     assert {kind: value for kind, value in found.items() if value < least[kind]} == {}
 
 
