@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -26,6 +27,7 @@ from workflows.composite import composite
 from workflows.composite.backdrops.around import Plate, expose, plate_of
 from workflows.composite.live.nodes.blender import write_blender
 from workflows.composite.live.nodes.exr import LOOKUPS, write_lookups
+from workflows.images.tone_curves import to_light
 
 needs_blender = pytest.mark.skipif(
     importlib.util.find_spec("bpy") is None,
@@ -80,6 +82,44 @@ def test_backdrop_of_any_size_is_averaged_over_the_cells(objects: Objects, tmp_p
     backdrop = np.stack([x / 200, y / 90, 0.5 + 0.4 * np.sin(x / 20)], axis=-1).astype(np.float32)
     expected = composite(matte, backdrop)
     assert psnr(render(tmp_path, backdrop), expected, expected[..., 3] > 0) > 50
+
+
+FRAME = """
+import sys, bpy
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+scene = bpy.context.scene
+print(scene.frame_start, scene.frame_end, scene.render.fps / scene.render.fps_base)
+scene.frame_set(scene.frame_end)
+bpy.ops.render.render(write_still=True)
+"""
+"""Renders the last frame of a .blend."""
+
+
+@needs_blender
+def test_a_clip_moves_in_what_is_saved(objects: Objects, tmp_path: Path) -> None:
+    matte = few_nodes(objects, 3)
+    write_nodes(matte, tmp_path, 3)
+    grey = 60, 120, 180
+    with av.open(tmp_path / "clip.mp4", "w") as clip:
+        stream = clip.add_stream("libx264", rate=25, width=150, height=74, pix_fmt="yuv420p")
+        for value in grey:
+            clip.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((74, 150, 3), value, np.uint8))))
+        clip.mux(stream.encode())
+    exr, blend = tmp_path / "glass.exr", tmp_path / "glass.blend"
+    files = ["--backdrop", str(tmp_path / "clip.mp4"), "--output", str(exr), "--save", str(blend)]
+    found = []
+    for command in ([str(tmp_path / "blender.py"), "--", *files], ["-c", FRAME, str(blend)]):
+        done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        found.append(read_channels(exr)[0]["G"])
+    assert "1 3 25.0\n" in done.stdout
+    for seen, value in zip(found, (grey[0], grey[-1]), strict=True):
+        light = np.full((74, 150, 3), to_light(np.float32(value / 255), "srgb"), np.float32)
+        np.testing.assert_allclose(seen, composite(matte, light)[..., 1], atol=0.02)
+    command = [str(tmp_path / "blender.py"), "--", *files[:2], "--material"]
+    done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert "--material needs a still" in done.stderr
 
 
 @needs_blender

@@ -363,10 +363,18 @@ def folder() -> Path:
     return Path(bpy.path.abspath(text.filepath) if text else __file__).resolve().parent
 
 
+def show_all_frames(scene: Any, backdrop: Any) -> None:
+    """Let a clip move, which is its first frame otherwise, and the scene last as long as it."""
+    fps = bpy.data.movieclips.load(bpy.path.abspath(backdrop.image.filepath)).fps
+    scene.render.fps, scene.render.fps_base = round(fps), round(fps) / fps
+    scene.frame_start, scene.frame_end = 1, backdrop.image.frame_duration
+    backdrop.frame_duration = backdrop.image.frame_duration
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--backdrop", type=Path, help="A picture; linear light if it is an EXR.")
-    parser.add_argument("--output", type=Path, help="An EXR to render.")
+    parser.add_argument("--backdrop", type=Path, help="A picture, linear light if it is an EXR; or a clip.")
+    parser.add_argument("--output", type=Path, help="An EXR to render, of a clip's first frame.")
     parser.add_argument("--save", type=Path, help="A .blend to write.")
     parser.add_argument(
         "--material", action="store_true", help="Make a material of the glass before the backdrop."
@@ -384,6 +392,10 @@ def main() -> None:
         backdrop = nodes.new("CompositorNodeImage")
         backdrop.image = bpy.data.images.load(str(given.backdrop.resolve()))
         size = backdrop.image.size
+        if backdrop.image.source == "MOVIE":
+            if given.material:
+                parser.error("--material needs a still as --backdrop")
+            show_all_frames(scene, backdrop)
     # Samples fall on pixels where the cells have a whole number of them.
     pixels = max(-(-n // cells) for n, cells in zip(size, MATTE["levels"][0], strict=True))
     taps = min(pixels * -(-FINEST_TAPS // pixels), MOST_TAPS)
