@@ -41,7 +41,7 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     Returns
     -------
     (height, width, 1 to 4) uint8 or uint16, or (height, width, 1 or 3) float32
-        Upright, grey or RGB. Integers keep an alpha channel; float values are linear light without one.
+        Upright, grey or RGB. Integers keep an alpha channel; float values are linear light, black where transparent.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     if raw_files.is_raw(data):
         return camera_raw.develop(data, memory=memory)
     if float_formats.is_float(data):
-        return float_formats.in_rec_709(data, float_formats.decode(data, memory=memory))
+        return float_formats.in_rec_709(data, float_formats.decode(data, memory=memory, alpha=True))
     pixels = integer_formats.decode(data, memory=memory, alpha=True, formats=FORMATS)
     return _to_srgb(data, pixels) if transfer == "srgb" else pixels
 

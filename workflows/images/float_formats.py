@@ -2,7 +2,9 @@
 
 import io
 import re
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 import imagecodecs
 import numpy as np
@@ -43,7 +45,7 @@ def is_float(data: bytes) -> bool:
         return False
 
 
-def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
+def decode(data: bytes, *, memory: int, turn: int | None = None, alpha: bool = False) -> Floats:
     """Decode an EXR, a Radiance HDR or a float TIFF.
 
     Parameters
@@ -53,6 +55,8 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
         Bytes that decoding may take; checked by the header, before anything is decoded.
     turn : int, optional
         Orientation of a TIFF, see `orientation.upright`; by default the file's own. The others have none.
+    alpha : bool
+        Whether transparent pixels become black, in proportion. An EXR has them so already.
 
     Returns
     -------
@@ -65,13 +69,11 @@ def decode(data: bytes, *, memory: int, turn: int | None = None) -> Floats:
     ImageError
         If it is damaged, too large, or of an unsupported kind.
     """
-    kind, read = "TIFF", _tiff
-    if data.startswith(EXR):
-        kind, read = "EXR", _exr
-    elif data.startswith(HDR):
-        kind, read = "HDR", _hdr
+    kind = "EXR" if data.startswith(EXR) else "HDR" if data.startswith(HDR) else "TIFF"
+    readers: dict[str, Callable[[bytes, int], Floats]]
+    readers = {"EXR": _exr, "HDR": _hdr, "TIFF": partial(_tiff, alpha=alpha)}
     try:
-        pixels = read(data, memory)
+        pixels = readers[kind](data, memory)
     except ImageError:
         raise
     except Exception as error:  # as above
@@ -189,7 +191,7 @@ def _hdr(data: bytes, memory: int) -> Floats:
     return pixels
 
 
-def _tiff(data: bytes, memory: int) -> Floats:
+def _tiff(data: bytes, memory: int, alpha: bool) -> Floats:
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         page = file.pages[0]
         check_tiles(page, memory)
@@ -202,11 +204,18 @@ def _tiff(data: bytes, memory: int) -> Floats:
         height, width = page.imagelength, page.imagewidth
         stored = -(-page.nbytes // (width * height))
         channels = 3 if page.samplesperpixel > 2 else 1
-        check_size(width, height, stored + 4 * channels, memory, "float pixels")
+        alpha = alpha and page.extrasamples[:1] == (
+            tifffile.EXTRASAMPLE.UNASSALPHA,
+        )  # else it is in the colours
+        check_size(width, height, stored + 4 * (channels + alpha), memory, "float pixels")
         tiff_lzw.check_lzw(data, page)
         array = np.asarray(page.asarray())
         if array.size != height * width * page.samplesperpixel:
             raise ImageError("the TIFF image is damaged, its tags contradict each other: export it again")
         if page.axes == "SYX":
             array = np.moveaxis(array, 0, -1)
-        return np.ascontiguousarray(array.reshape(height, width, -1)[:, :, :channels], np.float32)
+        array = array.reshape(height, width, -1)
+        light = np.array(array[:, :, :channels], np.float32, order="C")
+        if alpha:
+            light *= np.clip(array[:, :, channels : channels + 1], 0, 1)
+        return light

@@ -13,6 +13,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
+from workflows.images.decode import decode as decode_backdrop
 from workflows.images.float_formats import decode, is_float
 
 MEMORY = 1 << 20
@@ -76,6 +77,18 @@ def test_a_float_tiff_is_read_exactly(dtype: str, compression: str | None) -> No
         data = tiff(written, photometric=kind, compression=compression, **layout)
         assert is_float(data)
         np.testing.assert_array_equal(decode(data, memory=MEMORY), expected.astype(np.float32))
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("extra", ["unassalpha", "assocalpha", "unspecified"])
+def test_a_backdrop_is_black_where_a_float_tiff_is_transparent(channels: int, extra: str) -> None:
+    light, alpha = 3 * np.ones((4, 6, channels), np.float32), np.linspace(-0.5, 1.5, 6, dtype=np.float32)
+    pixels = np.concatenate([light, np.broadcast_to(alpha[:, np.newaxis], (4, 6, 1))], axis=-1)
+    kind = {"photometric": "rgb" if channels == 3 else "minisblack", "planarconfig": "contig"}
+    data = tiff(pixels, extrasamples=[extra], **kind)
+    clear = np.clip(alpha, 0, 1)[:, np.newaxis] if extra == "unassalpha" else 1
+    np.testing.assert_array_equal(decode_backdrop(data, "srgb", memory=MEMORY), light * clear)
+    np.testing.assert_array_equal(decode(data, memory=MEMORY), light)
 
 
 @pytest.mark.parametrize(
