@@ -62,12 +62,22 @@ Lobes = Annotated[
         description="The most lobes of a pixel; further ones are merged into these.",
     ),
 ]
-Lookups = Annotated[
-    int,
+FittingLobes = Annotated[
+    int | None,
+    Query(
+        ge=1,
+        le=layers.MOST_LOBES,
+        description="The most lobes of a pixel; further ones are merged into these. "
+        f"By default {layers.LOBES}, and of a large frame as many as take 1 GiB before they are compressed.",
+    ),
+]
+FittingLookups = Annotated[
+    int | None,
     Query(
         ge=1,
         le=LOOKUPS,
-        description="The most lookups of a pixel in the files of a node; further cells are merged into these.",
+        description="The most lookups of a pixel in the files of a node; further cells are merged into these. "
+        f"By default {LOOKUPS}, and of a large frame as many as take 1 GiB before they are compressed.",
     ),
 ]
 OverPlate = Annotated[
@@ -136,8 +146,8 @@ async def get_layer(
     id: str,
     file: str,
     request: Request,
-    lobes: Lobes = layers.LOBES,
-    lookups: Lookups = LOOKUPS,
+    lobes: FittingLobes = None,
+    lookups: FittingLookups = None,
     plate: OverPlate = False,
 ) -> Response:
     """A layer: `S`, `rho`, `alpha` or `confidence`, as `.png` (16 bits, linear, clipped to 0 to 1) or `.exr`;
@@ -152,21 +162,34 @@ async def get_layer(
     if plate and file not in OF_PLATE:
         raise InvalidInput(f"{file} takes no plate: only {', '.join(OF_PLATE)} do", field="plate")
 
+    progress, matte = await context.call(open_whole_frame, context, id)
+    lobes_each = lobes or _most_that_fit(layers.bytes_of_everything, matte, layers.LOBES)
+    lookups_each = lookups or _most_that_fit(bytes_of_lookups, matte, LOOKUPS)
+
     def headers_of(progress: Progress) -> dict[str, str]:
         # Neither a matte that is ready nor a preview ever changes; what is made of them may with an upgrade.
-        tag = f'"{VERSION}-{progress.whole_frame}-{file}-{lobes}-{lookups}-{plate}"'
+        tag = f'"{VERSION}-{progress.whole_frame}-{file}-{lobes_each}-{lookups_each}-{plate}"'
         headers = progress.headers | {"ETag": tag}
         # Saved and not shown: here it would be a page of the service.
         return headers | ({"Content-Disposition": "attachment"} if file.endswith(".html") else {})
 
-    progress, matte = await context.call(open_whole_frame, context, id)
     headers = headers_of(progress)
     if etag_matches(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    size, number, name = layers.bytes_of_everything(matte.width, matte.height, lobes), lobes, "lobes"
-    if file in NODES:
-        size, number, name = bytes_of_lookups(matte.width, matte.height, lookups), lookups, "lookups"
-    if file not in FILES and size > MOST_BYTES:
+    size, number, name = 0, 0, ""  # of the live form, whatever the frame, and of single layers
+    if file == ALL:
+        size, number, name = (
+            layers.bytes_of_everything(matte.width, matte.height, lobes_each),
+            lobes_each,
+            "lobes",
+        )
+    elif file in nodes.FILES:
+        size, number, name = (
+            bytes_of_lookups(matte.width, matte.height, lookups_each),
+            lookups_each,
+            "lookups",
+        )
+    if size > MOST_BYTES:
         raise InvalidInput(
             f"{file} with {number} {name} takes {size} bytes, and the limit is {MOST_BYTES}: ask for fewer {name}, or "
             "for the layers one by one",
@@ -177,9 +200,9 @@ async def get_layer(
 
     def write(found: stored_mattes.Matte, given: dict[str, Any], target: IO[bytes]) -> None:
         if file in NODES:
-            NODES[file](found, target, lookups, **given)
+            NODES[file](found, target, lookups_each, **given)
         elif file == ALL:
-            layers.everything(found, target, lobes)
+            layers.everything(found, target, lobes_each)
         else:
             FILES[file](found, target, **given)
 
@@ -189,11 +212,17 @@ async def get_layer(
         return file_response(partial(write, found, given), MEDIA_TYPES[kind], headers_of(now))
 
     work = partial(while_there, context, progress, encode)
-    memory = LOOK_BYTES + layers.bytes_of_band(matte, lobes)
+    memory = LOOK_BYTES + layers.bytes_of_band(matte, lobes_each)
     if file in NODES:
-        band = bytes_of_lookups(matte.width, matte.block, lookups)
+        band = bytes_of_lookups(matte.width, matte.block, lookups_each)
         memory = CORES * LOOK_BYTES + (bytes_of_live(matte) if file == live_module.LIVE else band)
     return await context.compute(request, context.shares.layers, work, memory=memory)
+
+
+def _most_that_fit(bytes_of: Callable[[int, int, int], int], matte: stored_mattes.Matte, most: int) -> int:
+    """How many lobes or lookups of a pixel a file has room for: at most `most`, and one at least."""
+    numbers = range(most, 1, -1)
+    return next((n for n in numbers if bytes_of(matte.width, matte.height, n) <= MOST_BYTES), 1)
 
 
 @router.get("/mattes/{id}/transport", response_model=Transport)

@@ -1,5 +1,6 @@
 """Composites on a real port: an owner has a share of what waits on disk, and broken uploads leave nothing."""
 
+import io
 import socket
 import threading
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from urllib.parse import urlsplit
 
 import httpx2
 import numpy as np
+import OpenEXR
 import pytest
 import uvicorn
 from sqlalchemy import Engine
@@ -24,7 +26,9 @@ from storage.objects.store import Objects
 from storage.records import api_keys, mattes
 from tests.parts.inputs.hostile_mattes import large_matte
 from tests.parts.waiting import until
+from workflows.composite.live.nodes.exr import bytes_of_lookups
 from workflows.images.integer_formats import encode_png
+from workflows.mattes.layers import bytes_of_everything
 
 LIMIT = 2 << 20
 """Bytes of a backdrop."""
@@ -126,6 +130,32 @@ def test_picture_in_a_form_is_refused(api: Api) -> None:
     answer = httpx2.post(url, files={"file": BACKDROP}, headers=headers, timeout=120)
     assert answer.status_code == 415
     assert "not in a form" in answer.json()["detail"]
+
+
+def test_large_frames_have_as_many_lobes_and_lookups_as_fit(
+    api: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def get(file: str, **query: int) -> httpx2.Response:
+        url = f"{api.url}/v1/mattes/alice/layers/{file}"
+        headers = {"Authorization": f"Bearer {api.keys['alice']}"}
+        return httpx2.get(url, params=query, headers=headers, timeout=120)
+
+    def weights(file: str) -> int:
+        with OpenEXR.File(io.BytesIO(get(file).content), separate_channels=True) as held:
+            return sum(
+                name.startswith(("weight", "lobe")) and name.endswith(".R") for name in held.channels()
+            )
+
+    monkeypatch.setattr(layers, "MOST_BYTES", bytes_of_lookups(64, 64, 5))
+    assert weights("lookups.exr") == 5
+    assert "'lookups': 5" in get("blender.py").text
+    assert get("blender.py", lookups=6).json()["field"] == "lookups"
+    monkeypatch.setattr(layers, "MOST_BYTES", bytes_of_everything(64, 64, 3))
+    assert weights("all.exr") == 3
+    assert get("all.exr", lobes=4).json()["field"] == "lobes"
+    monkeypatch.setattr(layers, "MOST_BYTES", 1)
+    assert get("all.exr").json()["limit"] == 1
+    assert get("matte.live").status_code == get("envmatte.js").status_code == 200
 
 
 def test_upgrade_changes_the_tags_of_composites_and_layers(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
