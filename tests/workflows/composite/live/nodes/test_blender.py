@@ -161,6 +161,22 @@ def test_an_output_that_blender_would_write_under_another_name_is_refused(
     assert "--output must end in .exr" in done.stderr
 
 
+@pytest.mark.parametrize("version", [(4, 4, 3), (5, 0, 1)])
+def test_another_blender_is_named_with_what_to_do(
+    objects: Objects, tmp_path: Path, version: tuple[int, ...]
+) -> None:
+    write_nodes(few_nodes(objects, 3), tmp_path, 3)
+    number = ".".join(map(str, version))
+    app = f"class app:\n    version, version_string = {version}, {number!r}\n"
+    (tmp_path / "bpy.py").write_text(app)  # nothing else of it is needed
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "blender.py")], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 1
+    message = done.stderr.splitlines()[-1]
+    assert f"this is {number}: run it with --save in Blender 4.5" in message
+
+
 @needs_blender
 def test_the_text_editor_adds_a_group_and_leaves_the_output(objects: Objects, tmp_path: Path) -> None:
     write_nodes(few_nodes(objects, 3), tmp_path, 3)

@@ -9,7 +9,7 @@ what the glass goes over. Or without a window::
 
 With ``--material`` it makes a material as well, for a plane of the frame's aspect in front of a still backdrop.
 
-`python` with the package `bpy` does the same as `blender -b -P`. It takes Blender 4.5.
+`python` with the package `bpy` does the same as `blender -b -P`. It takes Blender 4.5. Blender 5 opens what that saves.
 """
 
 import argparse
@@ -382,6 +382,12 @@ def main() -> None:
     given = parser.parse_args(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else [])
     if given.output and given.output.suffix.lower() != ".exr":
         parser.error("--output must end in .exr")  # Blender would write it under another name
+    if not (4, 5) <= bpy.app.version < (5,):
+        # And not SystemExit, which would close the window of the text editor.
+        raise RuntimeError(
+            f"this script takes Blender 4.5, and this is {bpy.app.version_string}: run it with --save in Blender 4.5. "
+            "Blender 5 opens the .blend that it saves"
+        )
     scene = bpy.context.scene
     scene.use_nodes = True
     if given.output:  # a scene of its own, without the cube and the render that new scenes show
