@@ -9,7 +9,7 @@
 // monitor's pixels are those of the matte. In a file that `envmatte layers --for glsl` wrote, all that the module needs
 // is within it, the shaders too: they are those of the web app.
 import { decodeLive } from "../app/composite/live/live_form.js";
-import { createPainter, webglContext } from "../app/composite/live/webgl.js";
+import { createPainter, sizeOf, webglContext } from "../app/composite/live/webgl.js";
 
 // Fetches a matte and prepares a canvas, whose size becomes the matte's. Throws if there is no WebGL2 that renders to
 // floating-point textures, if the matte is larger than a texture may be, or if it cannot be fetched.
@@ -23,13 +23,19 @@ export async function openGlass(canvas, url, monitor) {
 	const packed = held[0] === 0x1f && held[1] === 0x8b;
 	const plain = packed ? new Blob([held]).stream().pipeThrough(new DecompressionStream("gzip")) : held;
 	const matte = decodeLive(await new Response(plain).arrayBuffer());
-	if (Math.max(matte.width, matte.height, ...matte.texture) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("The matte is too large for this device.");
+	const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+	if (Math.max(matte.width, matte.height, ...matte.texture) > most) throw new Error("The matte is too large for this device.");
 	const painter = createPainter(gl, matte, monitor);
 	return {
 		width: matte.width,
 		height: matte.height,
-		// Takes a picture, or the current frame of a video or canvas. It is encoded in sRGB, as pictures of the web are.
-		setBackdrop: painter.setBackdrop,
+		// Takes a picture, or the current frame of a video or canvas. It is encoded in sRGB, as pictures of the web are. Throws
+		// if it has more pixels along a side than this device takes.
+		setBackdrop(picture) {
+			const size = sizeOf(picture);
+			if (Math.max(...size) > most) throw new Error(`The picture has ${size.join(" x ")} pixels, and this device takes ${most} along a side: make it smaller.`);
+			painter.setBackdrop(picture);
+		},
 		// Draws the glass. The backdrop is moved by `right` and `down`, in its widths and heights; `scale` times as large; and
 		// turned clockwise by `angle` degrees. An `endless` one goes on beyond its edges; `around` shows it where pixels were
 		// left out. Only every 2 ** `coarser`-th row and column is drawn, for slow devices.

@@ -63,6 +63,34 @@ def test_page_draws_what_the_service_composites(
         notes = {"name": "notes.txt", "mimeType": "text/plain", "buffer": b"no picture"}
         page.locator("input").set_input_files(notes)
         expect(page.get_by_role("status")).to_have_text("This browser cannot read the file as a picture.")
+        wide = png(np.zeros((1, 20_000, 3)), "srgb", np.uint8)
+        page.locator("input").set_input_files({"name": "wide.png", "mimeType": "image/png", "buffer": wide})
+        expect(page.get_by_role("status")).to_contain_text(
+            "The picture has 20000 x 1 pixels, and this device"
+        )
+
+
+IMAGE = """<!doctype html>
+<canvas></canvas><img src="beach.png" style="width: 16px">
+<script type="module">
+import { openGlass } from "./envmatte.js";
+const glass = await openGlass(document.querySelector("canvas"), "matte.live", [1280, 960]);
+const image = document.querySelector("img");
+await image.decode();
+glass.setBackdrop(image);
+glass.draw();
+</script>"""
+
+
+def test_image_of_a_page_has_its_own_pixels_however_small_it_is_shown(
+    browser: Browser, site: str, written: Path, service: Service, ready: tuple[str, str]
+) -> None:
+    beach = png(glass_ball.backdrop(640, 480), "srgb", np.uint8)
+    (written / "beach.png").write_bytes(beach)
+    (written / "image.html").write_text(IMAGE)
+    with opened(browser) as page:
+        page.goto(f"{site}/image.html")
+        assert psnr(drawn(page), composite(service, ready[1], beach)) > 30
 
 
 def test_matte_that_is_not_there_is_explained(browser: Browser, site: str, written: Path) -> None:

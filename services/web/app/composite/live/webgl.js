@@ -126,6 +126,11 @@ export function webglContext(canvas) {
 	return gl?.getExtension("EXT_color_buffer_float") || gl?.getExtension("EXT_color_buffer_half_float") ? gl : null;
 }
 
+// The width and height of a picture's own pixels: those that an image or a video is shown with may be others.
+export function sizeOf(picture) {
+	return [picture.videoWidth ?? picture.naturalWidth ?? picture.width, picture.videoHeight ?? picture.naturalHeight ?? picture.height];
+}
+
 // A painter of a matte that `decodeLive` has decoded.
 export function createPainter(gl, matte, monitor) {
 	const { width, height, levels, texture, finest } = matte;
@@ -221,7 +226,7 @@ export function createPainter(gl, matte, monitor) {
 		setBackdrop(picture) {
 			gl.activeTexture(gl.TEXTURE0 + PICTURE);
 			gl.texImage2D(gl.TEXTURE_2D, 0, gl.SRGB8_ALPHA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
-			const size = [picture.videoWidth ?? picture.width, picture.videoHeight ?? picture.height];
+			const size = sizeOf(picture);
 			gl.activeTexture(gl.TEXTURE0 + BACKDROP);
 			if (size.some((one, i) => one !== shown[i])) {
 				gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, ...size, 0, gl.RGBA, gl.HALF_FLOAT, null);
