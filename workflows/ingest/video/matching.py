@@ -14,7 +14,7 @@ from workflows.ingest.video.border_reader import find_by_numbers
 from workflows.ingest.video.border_spill import without_border
 from workflows.ingest.video.boundaries import Edge
 from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share
-from workflows.ingest.video.missing_patterns import Reason, by_reason, ranges
+from workflows.ingest.video.missing_patterns import Reason, by_reason, ranges, remedy
 from workflows.ingest.video.recording import Recording
 from workflows.ingest.video.signatures import LargeFrames, Signatures
 from workflows.ingest.video.timing import FoundPatterns, find_by_timing
@@ -257,15 +257,14 @@ def _require_enough(
     why = "; ".join(_by_reason(reasons))
     if not there.any() or (np.ptp(sent[there], axis=0) < np.ptp(sent, axis=0) / 2).any():
         raise expected.refusal(
-            f"the dark and bright constant patterns are not both found: {why}. Record it again"
+            f"the dark and bright constant patterns are not both found: {why}; {remedy(reasons.values())}"
         )
     measured = expected.program.measured
     measured = measured[measured < shown]
     share = float(np.isin(measured, list(looks)).mean()) if measured.size else 0.0
     if share < MIN_SHARE:
         raise expected.refusal(
-            f"only {share:.0%} of the patterns are found: {why}. Record it again, at more frames a second, or show "
-            f"fewer than {expected.rate:g} patterns a second"
+            f"only {share:.0%} of the patterns are found: {why}; {remedy(reasons.values())}"
         )
 
 

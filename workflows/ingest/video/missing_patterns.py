@@ -1,5 +1,6 @@
 """Patterns that are missing from a recording: why, and what to do about it."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from itertools import chain, groupby
@@ -57,6 +58,7 @@ def ranges(numbers: Iterable[int]) -> str:
 
 
 def remedy(reasons: Iterable[str]) -> str:
-    """What to do about patterns that are missing for these reasons."""
-    known = [REMEDIES.get(reason, _LONGER).split("; ") for reason in sorted(reasons)]
+    """What to do about patterns that are missing for these reasons, the most frequent first."""
+    frequent = Counter(sorted(reasons)).most_common()
+    known = [REMEDIES.get(reason, _LONGER).split("; ") for reason, _ in frequent]
     return "film again: " + "; ".join(dict.fromkeys(chain(*known)))

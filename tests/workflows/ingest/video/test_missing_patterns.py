@@ -6,7 +6,7 @@ import pytest
 from tests.workflows.ingest.video.camera import Camera, film
 from tests.workflows.ingest.video.films import PROGRAM, IngestFilm
 from workflows.ingest.report.report import report
-from workflows.ingest.video.missing_patterns import REMEDIES, by_reason, ranges, remedy
+from workflows.ingest.video.missing_patterns import REMEDIES, Reason, by_reason, ranges, remedy
 
 
 @pytest.mark.parametrize(
@@ -32,6 +32,12 @@ def test_patterns_without_a_frame_are_named_with_a_remedy(
     assert set(reasons.values()) <= REMEDIES.keys()
     for numbers, reason in by_reason({int(number): reason for number, reason in reasons.items()}):
         assert f"{ranges(numbers)} ({reason})" in finding.message
+
+
+def test_what_is_missing_most_is_remedied_first() -> None:
+    reasons = [Reason.AFTER, Reason.TORN, Reason.AFTER]
+    first, then = (REMEDIES[reason] for reason in (Reason.AFTER, Reason.TORN))
+    assert remedy(reasons) == f"film again: {first}; {then}"
 
 
 @pytest.mark.parametrize(

@@ -343,6 +343,4 @@ export const de = {
 	"{share} % of the light is explained neither by the patterns nor by noise, as with sharpening, compression or scattered light: that alone limits composites to about {limit} dB": "{share} % des Lichts erklären weder die Muster noch das Rauschen, wie bei Schärfung, Kompression oder Streulicht: Das allein begrenzt Montagen auf etwa {limit} dB",
 	"{stops} stops": "{stops} Blenden",
 	"{which} ({why})": "{which} ({why})",
-	"{why}. Record it again": "{why}. Neu aufnehmen",
-	"{why}. Record it again, at more frames a second, or show fewer than {rate} patterns a second": "{why}. Neu aufnehmen, mit mehr Bildern pro Sekunde, oder weniger als {rate} Muster pro Sekunde zeigen",
 };
