@@ -39,6 +39,8 @@ LIGHT_BYTES = 12
 """Of a node's light in three channels, which a composite holds."""
 CHECK_BYTES = 64
 """Of a cell and its weight while they are checked."""
+CAPTURE = "capture.json"
+"""An entry of capture archives."""
 AGAIN = "export the matte again"
 
 
@@ -109,6 +111,9 @@ class Reader:
 
     def _read_manifest(self) -> None:
         """Read what the entries are, one after another: the list of all faults takes a kilobyte for each."""
+        if CAPTURE in self._entries and MANIFEST not in self._entries:
+            why = "this is a capture archive: upload it, with `envmatte upload` or in the web app"
+            raise ArchiveError(why, entry=MANIFEST)
         entries = len(self._entries)
         document = self._document(MANIFEST, 4096 + MEMBER_BYTES * entries, entries + MOST_FIELDS)
         members = document.get("members") if isinstance(document, dict) else None

@@ -130,6 +130,8 @@ def test_what_is_no_archive_of_a_matte_is_refused_in_words(archive: bytes) -> No
         ArchivedMatte(io.BytesIO(archive[: len(archive) // 2]))
     with pytest.raises(ArchiveError, match=r"envmatte\.json: it is not in the archive"):
         ArchivedMatte(io.BytesIO(packed({"notes.txt": b"no matte"})))
+    with pytest.raises(ArchiveError, match="this is a capture archive: upload it"):
+        ArchivedMatte(io.BytesIO(packed({"capture.json": b"{}"})))
 
 
 def test_damage_is_found_where_it_is_read(archive: bytes) -> None:

@@ -286,6 +286,7 @@ export const de = {
 	"there is no {entry} at the root of the archive: make it of the film or the stills with `envmatte pack`, or drop these in the web app as they are, without a ZIP": "es gibt kein {entry} auf der obersten Ebene des Archivs: es mit `envmatte pack` aus dem Film oder den Fotos machen, oder diese ohne ZIP in der Web-App ablegen",
 	"this PNG is animated: save a single picture": "dieses PNG ist animiert: ein einzelnes Bild speichern",
 	"this camera's RAW format is not supported: convert it to DNG, with lossless compression other than JPEG XL, or develop it to TIFF of 16 bits with a linear curve": "das RAW-Format dieser Kamera ist nicht lesbar: in DNG umwandeln, verlustfrei und nicht mit JPEG XL, oder als TIFF mit 16 Bit und linearer Kennlinie entwickeln",
+	"this is a capture archive: upload it, with `envmatte upload` or in the web app": "das ist das Archiv einer Aufnahme: mit `envmatte upload` oder in der Web-App hochladen",
 	"this is not a {formats} or HEIC image, or it is cut off: copy it again from the camera, or save it as PNG": "das ist kein Bild in {formats} oder HEIC, oder es ist abgeschnitten: neu von der Kamera kopieren oder als PNG speichern",
 	"this is the archive of a matte: import it, with `envmatte import` or in the web app": "das ist das Archiv einer Matte: mit `envmatte import` oder in der Web-App importieren",
 	"this link has expired or was deleted: ask the person who sent it for another": "dieser Link ist abgelaufen oder gelöscht: bei der Person, die ihn geschickt hat, einen neuen erbitten",
