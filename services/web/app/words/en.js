@@ -442,7 +442,7 @@ export const en = {
 	"transparent": "Transparent around the glass",
 	"transparent.none": "(all that is around it was recovered too: recover it again, and cut the object out)",
 	"undo": "Undo",
-	"unlock.cancelled": "Who runs the service makes one with `envmatte keys make`.",
+	"unlock.cancelled": "Those who run the service make one with `envmatte keys make`.",
 	"unlock.kept": "This browser keeps it until you close this tab.",
 	"unlock.key": "Key of the service",
 	"unlock.title": "This service needs a key",
