@@ -176,20 +176,12 @@ async def get_layer(
     headers = headers_of(progress)
     if etag_matches(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    size, number, name = 0, 0, ""  # of the live form, whatever the frame, and of single layers
-    if file == ALL:
-        size, number, name = (
-            layers.bytes_of_everything(matte.width, matte.height, lobes_each),
-            lobes_each,
-            "lobes",
-        )
-    elif file in nodes.FILES:
-        size, number, name = (
-            bytes_of_lookups(matte.width, matte.height, lookups_each),
-            lookups_each,
-            "lookups",
-        )
-    if size > MOST_BYTES:
+    of_lobes = layers.bytes_of_everything, lobes_each, "lobes"
+    of_lookups = bytes_of_lookups, lookups_each, "lookups"
+    bytes_of, number, name = of_lookups if file in nodes.FILES else of_lobes
+    size = bytes_of(matte.width, matte.height, number)
+    # The live form and single layers of any frame are small enough.
+    if (file == ALL or file in nodes.FILES) and size > MOST_BYTES:
         raise InvalidInput(
             f"{file} with {number} {name} takes {size} bytes, and the limit is {MOST_BYTES}: ask for fewer {name}, or "
             "for the layers one by one",
