@@ -111,6 +111,21 @@ class PixelSample(NamedTuple):
         """Row and column of each pixel in the frame, (2, n)."""
         return self.corners[self.chosen[0]].T + self.chosen[1:]
 
+    def rings(self, widest: int) -> list[Floats]:
+        """The mean codes, as a share of full scale, of the square rings around each pixel, (frames, n) each: of its 8
+        neighbours, of the 16 pixels around these, and so on.
+        """
+        from scipy.ndimage import uniform_filter  # takes long to import
+
+        square, y, x = self.chosen
+        grey = self.codes.mean(axis=4, dtype=np.float32) / np.float32(np.iinfo(self.codes.dtype).max)
+        edges = range(1, 2 * widest + 2, 2)
+        sums = [
+            uniform_filter(grey, (0, 0, edge, edge))[:, square, y + _MARGIN, x + _MARGIN] * edge**2
+            for edge in edges
+        ]
+        return [(sums[n] - sums[n - 1]) / (8 * n) for n in range(1, len(sums))]
+
     def thinned(self, most: int) -> "PixelSample":
         """The same squares with at most so many of the chosen pixels, spread over all of them."""
         step = -(-len(self.chosen[0]) // most)

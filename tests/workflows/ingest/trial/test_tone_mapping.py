@@ -56,12 +56,19 @@ def filmed(scene: Scene, program: Program, power: float = 0.0, sharpening: float
 
 
 def left_by(
-    power: float, pixels: int = 400, frames: int = 40, *, mixed: float = 0.0, smeared: float = 0.0
+    power: float,
+    pixels: int = 400,
+    frames: int = 40,
+    *,
+    mixed: float = 0.0,
+    smeared: float = 0.0,
+    sharpened: float = 0.0,
 ) -> tuple[Stack, Rest, PixelSample]:
     """Residuals of pixels that see patterns as all black or all white, by a camera that maps tones.
 
     Where it is ``mixed``, patterns in colour are brighter in bright surroundings, and a channel sees so much of the
-    others. Where it is ``smeared``, a fifth of the values are neither, which changes those of the other channels.
+    others. Where it is ``smeared``, a fifth of the values are neither, which changes those of the other channels. Where
+    it is ``sharpened``, bright pixels around each, as are in bright surroundings, take so much of its light away.
     """
     rng = np.random.default_rng(1)
     thumbnails = gaussian_filter(rng.random((frames, 60, 80)), (0, 6, 6))
@@ -88,6 +95,8 @@ def left_by(
     seen = level * (flicker * np.exp(-power * around.T[:, np.newaxis]) - 1)
     seen += mixed * (plain.sum(axis=1, keepdims=True) - plain)
     seen += smeared * around.T[:, np.newaxis] * between.any(axis=1, keepdims=True)
+    rings = 0.5 + 0.5 * around + 0.1 * rng.standard_normal((3, frames, pixels))
+    seen += sharpened * level * (rings[0] - 2 * rings[1]).T[:, np.newaxis]
     rest = SimpleNamespace(
         flat=(rng.random(plain.shape) < 0.5) & ~between,
         frames=np.arange(frames),
@@ -97,7 +106,9 @@ def left_by(
         rest=(seen + NOISE * rng.standard_normal(plain.shape)) * 2 / 0.6,
         noise=NoiseModel(NOISE**2, 0.0),
     )
-    sample = SimpleNamespace(places=(y, x), chosen=(np.arange(pixels) // 10,))
+    sample = SimpleNamespace(
+        places=(y, x), chosen=(np.arange(pixels) // 10,), rings=lambda widest: list(rings[:widest])
+    )
     return cast(Stack, stack), cast(Rest, rest), cast(PixelSample, sample)
 
 
@@ -114,6 +125,11 @@ def test_power_is_that_of_the_residuals() -> None:
 def test_effect_of_other_colours_is_separated(power: float, by_colours: dict[str, float]) -> None:
     found = find_tone_mapping(*left_by(power, **by_colours), None)
     assert (found and found["power"]) == (pytest.approx(power, rel=0.1) if power else None)
+
+
+def test_sharpening_is_none_beside_the_pixels_that_it_takes_light_from() -> None:
+    assert find_tone_mapping(*left_by(0.0, sharpened=0.3), None) is None
+    assert find_tone_mapping(*left_by(0.1, sharpened=0.05), None) is not None
 
 
 @pytest.mark.parametrize("power", [-0.1, 0.0, LEAST / 2])
