@@ -24,7 +24,7 @@ from services.cli.demo_run import service
 
 CASES = ("ideal", "raw_stills", "jpeg_stills", "ideal_film", "phone_film", "phone_film_free")
 SCORES = ("lin", "disp", "mat")
-WITHIN = 3.0
+WITHIN = 2.0
 """dB that the promised range may miss what is reached by."""
 
 
