@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from workflows.ingest.camera.border_exposure import is_free
 from workflows.ingest.measured_light import patterns_seen
 from workflows.ingest.report.expected_psnr import costs_of, model_error_of
 from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
@@ -12,6 +13,8 @@ from workflows.ingest.report.frame_findings import constants, frames, named, odd
 from workflows.ingest.report.limits import (
     curves,
     is_assumed,
+    is_steady_enough,
+    lock_exposure,
     lost_colour,
     quality,
     unexplained,
@@ -53,7 +56,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
             attributes.get("auto_exposure"), costs["auto_exposure"], filmed=figures.video is not None
         ),
         *_tone_mapping(attributes.get("tone_mapping")),
-        *_steadiness(attributes.get("steadiness")),
+        *_steadiness(attributes),
         *_drift(figures.drift),
         *_scaling(program, scaled=attributes.get("scaled", False)),
         *curves(figures, program, linear=attributes["storage"]["black"] > 0),
@@ -115,9 +118,18 @@ def _white(figures: Figures) -> Finding:
     )
 
 
-def _steadiness(found: dict[str, Any] | None) -> list[Finding]:
-    if found is None or (found.get("drift") and found.get("flicker")):
+def _steadiness(attributes: dict[str, Any]) -> list[Finding]:
+    found, free = attributes.get("steadiness"), is_free(attributes.get("auto_exposure"))
+    if found is None or (found.get("drift") and (found.get("flicker") or free)):
         return []
+    if is_steady_enough(attributes):
+        return [
+            Finding(
+                name="steadiness",
+                level="good",
+                message="neither the camera moved nor the light flickered by so much that it shows",
+            )
+        ]
     return [
         Finding(
             name="steadiness",
@@ -226,11 +238,7 @@ def _auto_exposure(exposed: list[float] | None, cost: float, *, filmed: bool) ->
             cost=cost or None,
             remedy=""
             if level == "good"
-            else (
-                "lock exposure and ISO before filming"
-                if filmed
-                else "set exposure and ISO by hand for all stills"
-            )
+            else lock_exposure(filmed=filmed)
             + (
                 ": so large a change is followed only in part, and hides the camera's curve"
                 if level == "bad"

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from workflows.images.tone_curves import CameraCurve, Sampled, to_light
+from workflows.ingest.camera.border_exposure import is_free
 from workflows.ingest.report.figures import Figures, Finding, Quality, graded
 from workflows.programs.parts import Images
 from workflows.programs.program import Program
@@ -169,10 +170,11 @@ def unmeasured(figures: Figures, program: Program, attributes: dict[str, Any]) -
 
     larger = "show the object larger and brighter in the picture"
     steady = larger if attributes.get("steadiness") is None else "shoot RAW, with nothing that moves"
-    if figures.drift is None:
+    free, enough = is_free(attributes.get("auto_exposure")), is_steady_enough(attributes)
+    if figures.drift is None and not enough:
         lacks("the drift of the camera", steady)
-    if figures.flicker is None:
-        lacks("the flicker of the light", steady)
+    if figures.flicker is None and (free or not enough):
+        lacks("the flicker of the light", lock_exposure(filmed=figures.video is not None) if free else steady)
     if attributes.get("pattern_error") is None:
         lacks("glare and what else the patterns don't explain", larger)
     if is_assumed(attributes):
@@ -211,6 +213,17 @@ def unmeasured(figures: Figures, program: Program, attributes: dict[str, Any]) -
 def is_assumed(attributes: dict[str, Any]) -> bool:
     """Whether the noise is only assumed."""
     return bool(attributes.get("assumed_noise") and not attributes.get("noise_of_patterns"))
+
+
+def is_steady_enough(attributes: dict[str, Any]) -> bool:
+    """Whether patterns show so little beside T and noise that no movement or flicker among it can show."""
+    error = attributes.get("pattern_error")
+    return error is not None and error**2 - attributes["survey"]["deviation"] ** 2 < SHOWS
+
+
+def lock_exposure(*, filmed: bool) -> str:
+    """What to do about a camera whose exposure was not locked."""
+    return "lock exposure and ISO before filming" if filmed else "set exposure and ISO by hand for all stills"
 
 
 def _assumed(name: str, curve: CameraCurve) -> Finding:

@@ -40,6 +40,7 @@ def cases(attributes: dict[str, Any]) -> list[tuple[dict[str, Any], str, str | N
         return {"auto_exposure": [least, most, *np.ones(frames - 2).tolist()]}
 
     film = {"video": {"missing": {}}}
+    unexplained = {"pattern_error": 0.03}
 
     black = surveyed("black", clipped_low=0.4)
     mapped = {"tone_mapping": {"power": 0.2, "spread": 0.1}}
@@ -55,8 +56,10 @@ def cases(attributes: dict[str, Any]) -> list[tuple[dict[str, Any], str, str | N
         (surveyed("black", clipped_low=0.1), "black", "warning", "raise the camera's black level"),
         (black, "black", "bad", "raise the camera's black level"),
         (black | {"storage": storage | {"black": 4096}}, "black", "good", ""),
-        (steadiness(drift=None), "steadiness", "warning", "switch HDR"),
-        (steadiness(flicker=None), "steadiness", "warning", "switch HDR"),
+        (steadiness(drift=None) | unexplained, "steadiness", "warning", "switch HDR"),
+        (steadiness(flicker=None) | unexplained, "steadiness", "warning", "switch HDR"),
+        (steadiness(flicker=None) | unexplained | exposed(1.0, 2.0), "steadiness", None, ""),
+        ({"steadiness": {}, "pattern_error": 0.005}, "steadiness", "good", ""),
         (steadiness(), "steadiness", None, ""),
         (steadiness(), "drift", "warning", "it is not corrected"),
         (steadiness(drift=DRIFT | {"error": 0.1}), "drift", "good", ""),

@@ -90,6 +90,19 @@ def test_what_is_not_measured_is_listed_and_nowhere_good(stack: Stack) -> None:
     assert "constant frames" in found["unmeasured"].remedy
 
 
+def test_drift_and_flicker_that_cannot_show_are_not_missed(stack: Stack) -> None:
+    free = {"auto_exposure": [1.0, 2.0, *np.ones(len(stack.attributes["patterns"]) - 2).tolist()]}
+    for other, drift, flicker, remedy in (
+        ({}, False, False, "half-tones"),
+        ({"pattern_error": 0.03}, True, True, "nothing that moves"),
+        (free, False, True, "set exposure and ISO by hand"),
+    ):
+        _, found = findings(stack, steadiness={}, **other)
+        assert ("drift" in found["unmeasured"].message) == drift
+        assert ("flicker" in found["unmeasured"].message) == flicker
+        assert remedy in found["unmeasured"].remedy
+
+
 def test_stated_curve_is_checked_by_half_tones(stack: Stack) -> None:
     survey = stack.attributes["survey"]
     _, found = findings(stack, survey=survey | {"halftones_apart": 0.01})

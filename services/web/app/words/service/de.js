@@ -170,6 +170,7 @@ export const de = {
 	"must have {min_length} or more characters": "muss mindestens {min_length} Zeichen haben",
 	"must have {min_length} or more entries": "muss mindestens {min_length} Einträge haben",
 	"must match {pattern}": "muss zu {pattern} passen",
+	"neither the camera moved nor the light flickered by so much that it shows": "weder hat sich die Kamera bewegt, noch hat das Licht geflackert, so dass man es sähe",
 	"no border can be drawn on a display of {size} pixels: its cells need about 150 x 100, and 16384 x 16384 is the most": "auf einem Bildschirm mit {size} Pixeln hat kein Rand Platz: Seine Felder brauchen etwa 150 x 100, und 16384 x 16384 sind das Größte",
 	"no common shift of the frames explains it, so it is not corrected": "keine gemeinsame Verschiebung der Bilder erklärt sie, darum wird sie nicht ausgeglichen",
 	"no coordinator has ever given a sign of life; start `envmatte serve` or `envmatte coordinator`": "noch nie ein Lebenszeichen eines Koordinators; `envmatte serve` oder `envmatte coordinator` starten",
