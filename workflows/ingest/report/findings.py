@@ -67,7 +67,11 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *_noise(figures, attributes, costs["noise"]),
         *_flicker(figures.flicker, files, mapped=bool(attributes.get("tone_mapping"))),
         frames(figures),
-        *quality(figures.quality, any(isinstance(part, Bernoulli) for part in program.parts)),
+        *quality(
+            figures.quality,
+            random=any(isinstance(part, Bernoulli) for part in program.parts),
+            exposed=costs["auto_exposure"] > 0,
+        ),
         *unmeasured(figures, program, attributes),
     ]
     return sorted(found, key=lambda one: (-LEVELS.index(one.level), -(one.cost or 0.0)))

@@ -20,8 +20,17 @@ APART = 0.03
 mapping and flicker make."""
 
 
-def quality(expected: Quality | None, random: bool) -> list[Finding]:
-    """The PSNR to expect, graded by the middle of its range."""
+def quality(expected: Quality | None, *, random: bool, exposed: bool) -> list[Finding]:
+    """The PSNR to expect, graded by the middle of its range.
+
+    Parameters
+    ----------
+    expected : Quality or None
+    random : bool
+        Whether the program has random patterns.
+    exposed : bool
+        Whether the camera's exposure was not locked, which decides the low end.
+    """
     if expected is None:
         return []
     if not random:
@@ -34,6 +43,8 @@ def quality(expected: Quality | None, random: bool) -> list[Finding]:
             f": the random grids have no offsets, so light is located no finer than a block of the finest grid, with "
             f"{expected.blocks} along the shorter side. Patterns with offsets, as in the preset `default`, do better"
         )
+    if exposed:
+        worst, best = "if the scene is to be exposed otherwise", "exposed as white was"
     low, high = f"{expected.low:.0f}", f"{expected.high:.0f}"
     span = f"{low} dB" if low == high else f"{low} dB ({worst}) to {high} dB ({best})"
     level = graded(-(expected.low + expected.high) / 2, -FEW, -TOO_FEW)

@@ -25,14 +25,19 @@ MONITOR = 160, 120
     ("low", "high", "level"), [(41, 50, "good"), (26, 33, "warning"), (18, 25, "bad"), (24, 40, "good")]
 )
 def test_expected_quality_is_graded(low: float, high: float, level: str) -> None:
-    (found,) = quality(Quality(low=low, high=high, blocks=None), random=True)
+    expected = Quality(low=low, high=high, blocks=None)
+    (found,) = quality(expected, random=True, exposed=False)
     assert found.level == level
     assert bool(found.remedy) == (level != "good")
-    assert f"{low} dB" in found.message
+    assert f"{low} dB (dispersion, many edges) to {high} dB (clear glass)" in found.message
+    (found,) = quality(expected, random=True, exposed=True)
+    assert (
+        f"{low} dB (if the scene is to be exposed otherwise) to {high} dB (exposed as white" in found.message
+    )
 
 
 def test_nothing_is_said_of_an_unknown_quality() -> None:
-    assert quality(None, random=True) == []
+    assert quality(None, random=True, exposed=False) == []
 
 
 @pytest.mark.parametrize(("cost", "level"), [(1e-3, "warning"), (1e-2, "bad")])
