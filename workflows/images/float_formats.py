@@ -13,7 +13,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from storage.errors import ImageError
-from workflows.images.integer_formats import LOSSLESS, PLAIN, check_tiles, orientation
+from workflows.images.integer_formats import LOSSLESS, PLAIN, check_tiles, has_alpha, orientation
 from workflows.images.orientation import upright
 from workflows.images.writers.exr import write_exr
 from workflows.untrusted import tiff_lzw
@@ -69,11 +69,14 @@ def decode(data: bytes, *, memory: int, turn: int | None = None, alpha: bool = F
     ImageError
         If it is damaged, too large, or of an unsupported kind.
     """
-    kind = "EXR" if data.startswith(EXR) else "HDR" if data.startswith(HDR) else "TIFF"
-    readers: dict[str, Callable[[bytes, int], Floats]]
-    readers = {"EXR": _exr, "HDR": _hdr, "TIFF": partial(_tiff, alpha=alpha)}
+    kind = "TIFF"
+    read: Callable[[bytes, int], Floats] = partial(_tiff, alpha=alpha)
+    if data.startswith(EXR):
+        kind, read = "EXR", _exr
+    elif data.startswith(HDR):
+        kind, read = "HDR", _hdr
     try:
-        pixels = readers[kind](data, memory)
+        pixels = read(data, memory)
     except ImageError:
         raise
     except Exception as error:  # as above
@@ -204,9 +207,7 @@ def _tiff(data: bytes, memory: int, alpha: bool) -> Floats:
         height, width = page.imagelength, page.imagewidth
         stored = -(-page.nbytes // (width * height))
         channels = 3 if page.samplesperpixel > 2 else 1
-        alpha = alpha and page.extrasamples[:1] == (
-            tifffile.EXTRASAMPLE.UNASSALPHA,
-        )  # else it is in the colours
+        alpha = alpha and has_alpha(page)
         check_size(width, height, stored + 4 * (channels + alpha), memory, "float pixels")
         tiff_lzw.check_lzw(data, page)
         array = np.asarray(page.asarray())

@@ -223,12 +223,20 @@ def _tiff(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]
         array = np.asarray(page.asarray())
         array = array[..., np.newaxis] if page.axes == "YX" else array
         array = np.moveaxis(array, 0, -1) if page.axes == "SYX" else array
-        # TIFF 6.0, ExtraSamples: associated alpha is in the colours already, and unspecified samples are no alpha.
         colours = 3 if page.photometric == tifffile.PHOTOMETRIC.RGB else 1
-        has_alpha = page.extrasamples[:1] == (tifffile.EXTRASAMPLE.UNASSALPHA,)
         if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
             array = np.invert(array)
-        return array[..., : colours + has_alpha]
+        return array[..., : colours + has_alpha(page)]
+
+
+def has_alpha(page: tifffile.TiffPage) -> bool:
+    """Whether a TIFF has transparency beside its colours.
+
+    Notes
+    -----
+    TIFF 6.0, ExtraSamples: associated alpha is in the colours already, and unspecified samples are no alpha.
+    """
+    return bool(page.extrasamples[:1] == (tifffile.EXTRASAMPLE.UNASSALPHA,))
 
 
 def check_tiles(page: tifffile.TiffPage, memory: int) -> None:

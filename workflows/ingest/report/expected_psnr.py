@@ -131,9 +131,7 @@ def expected(
     fixed = not any(part.offset for part in random)
     measured = sum(count for part, count in shown if fixed or not isinstance(part, Bernoulli) or part.offset)
     blocks = max(min(part.columns, part.rows) for part in random) if fixed else None
-    # Patterns show no more of the error of the model than this.
-    shown_error = np.inf if pattern_error is None else max(pattern_error**2 - s2, 0.0)
-    model = costs["model_error"], min(costs["model_error"], shown_error)
+    model = costs["model_error"], min(costs["model_error"], beside_noise(survey, pattern_error))
     exposed = 0.0, 0.0
     if costs["auto_exposure"]:
         exposed = BACKDROP * (UNKNOWN_EXPOSURE * rho) ** 2, costs["auto_exposure"] / 4
@@ -152,6 +150,11 @@ def model_error_of(attributes: dict[str, Any]) -> float:
     See `workflows.ingest.trial.unexplained`; captures of earlier versions have no ``smooth_error``.
     """
     return float(attributes.get("smooth_error", attributes.get("model_error", 0.0)))
+
+
+def beside_noise(survey: dict[str, Any], pattern_error: float | None) -> float:
+    """The mean square of what patterns show beside T and noise; infinity if it is not known."""
+    return np.inf if pattern_error is None else max(pattern_error**2 - survey["deviation"] ** 2, 0.0)
 
 
 def left_of(program: Program, attributes: dict[str, Any]) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 
 from workflows.images.tone_curves import CameraCurve, Sampled, to_light
 from workflows.ingest.camera.border_exposure import is_free
+from workflows.ingest.report.expected_psnr import beside_noise
 from workflows.ingest.report.figures import Figures, Finding, Quality, graded
 from workflows.programs.parts import Images
 from workflows.programs.program import Program
@@ -228,8 +229,7 @@ def is_assumed(attributes: dict[str, Any]) -> bool:
 
 def is_steady_enough(attributes: dict[str, Any]) -> bool:
     """Whether patterns show so little beside T and noise that no movement or flicker among it can show."""
-    error = attributes.get("pattern_error")
-    return error is not None and error**2 - attributes["survey"]["deviation"] ** 2 < SHOWS
+    return beside_noise(attributes["survey"], attributes.get("pattern_error")) < SHOWS
 
 
 def lock_exposure(*, filmed: bool) -> str:

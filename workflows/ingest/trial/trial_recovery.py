@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
@@ -115,8 +116,6 @@ class PixelSample(NamedTuple):
         """The mean codes, as a share of full scale, of the square rings around each pixel, (frames, n) each: of its 8
         neighbours, of the 16 pixels around these, and so on.
         """
-        from scipy.ndimage import uniform_filter  # takes long to import
-
         square, y, x = self.chosen
         grey = self.codes.mean(axis=4, dtype=np.float32) / np.float32(np.iinfo(self.codes.dtype).max)
         edges = range(1, 2 * widest + 2, 2)

@@ -19,6 +19,7 @@ from storage.layout.matte_archive import GROUPS, MANIFEST
 from storage.layout.mattes import CHANNELS, FRAMES, Block
 from storage.objects.checksums import CODECS, is_checked, unseal
 from storage.objects.zarr_store import unpack
+from workflows.ingest.manifest import MANIFEST as CAPTURE
 from workflows.mattes.imports.checks import faults
 from workflows.mattes.imports.manifest import Attributes, Manifest, Member, valid
 from workflows.recovery.pyramid import Pyramid
@@ -39,8 +40,6 @@ LIGHT_BYTES = 12
 """Of a node's light in three channels, which a composite holds."""
 CHECK_BYTES = 64
 """Of a cell and its weight while they are checked."""
-CAPTURE = "capture.json"
-"""An entry of capture archives."""
 AGAIN = "export the matte again"
 
 

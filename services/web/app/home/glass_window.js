@@ -1,5 +1,6 @@
 // A live glass that fills the window: a canvas under it shows what is around it.
 import { LiveGlass } from "../composite/live/live_glass.js";
+import { sizeOf } from "../composite/live/webgl.js";
 import { h } from "../lib/dom.js";
 import { fetchSample, pictureOf, titleOf } from "./samples.js";
 import { t } from "../lib/words.js";
@@ -65,7 +66,7 @@ export class GlassWindow extends LiveGlass {
 	refresh() {
 		super.refresh();
 		const { picture, moving } = this.backdrop;
-		const [wide, high] = [picture.videoWidth ?? picture.width, picture.videoHeight ?? picture.height];
+		const [wide, high] = sizeOf(picture);
 		const less = moving ? Math.min(1, TILE / wide) : 1;
 		const [width, height] = [Math.round(wide * less), Math.round(high * less)];
 		Object.assign(this.#tile, { width: 2 * width, height: 2 * height });

@@ -1,5 +1,6 @@
 // Choices that are shown as small pictures.
 import { h, svg } from "../../lib/dom.js";
+import { sizeOf } from "../live/webgl.js";
 
 export const thumbs = (legend, choices) => h("fieldset.thumbs", h("legend", legend), h("div", choices));
 
@@ -19,7 +20,7 @@ const WIDE = 96; // pixels
 // The thumb of a backdrop: its picture or a frame of it, or the end of its name if this browser cannot draw it.
 export function thumbOf({ picture, name }) {
 	if (!picture) return h("strong.kind", name.slice(name.lastIndexOf(".") + 1));
-	const [width, height] = [picture.videoWidth ?? picture.width, picture.videoHeight ?? picture.height];
+	const [width, height] = sizeOf(picture);
 	const thumb = h("canvas", { width: WIDE, height: Math.max(1, Math.round((WIDE * height) / width)) });
 	const draw = () => thumb.getContext("2d").drawImage(picture, 0, 0, thumb.width, thumb.height);
 	draw();
