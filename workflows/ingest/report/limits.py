@@ -30,7 +30,7 @@ def quality(expected: Quality | None, *, random: bool, exposed: bool) -> list[Fi
     random : bool
         Whether the program has random patterns.
     exposed : bool
-        Whether the camera's exposure was not locked, which decides the low end.
+        Whether the camera's exposure was not locked, which decides the low end of a program with random patterns.
     """
     if expected is None:
         return []
@@ -44,7 +44,7 @@ def quality(expected: Quality | None, *, random: bool, exposed: bool) -> list[Fi
             f": the random grids have no offsets, so light is located no finer than a block of the finest grid, with "
             f"{expected.blocks} along the shorter side. Patterns with offsets, as in the preset `default`, do better"
         )
-    if exposed:
+    if exposed and random:
         worst, best = "if the scene is to be exposed otherwise", "exposed as white was"
     low, high = f"{expected.low:.0f}", f"{expected.high:.0f}"
     span = f"{low} dB" if low == high else f"{low} dB ({worst}) to {high} dB ({best})"

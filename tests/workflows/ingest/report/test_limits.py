@@ -36,6 +36,11 @@ def test_expected_quality_is_graded(low: float, high: float, level: str) -> None
     )
 
 
+def test_exposure_decides_no_end_of_what_stripes_alone_promise() -> None:
+    (found,) = quality(Quality(low=30, high=38, blocks=None), random=False, exposed=True)
+    assert "30 dB (backdrops finer than the patterns) to 38 dB (coarser ones)" in found.message
+
+
 def test_nothing_is_said_of_an_unknown_quality() -> None:
     assert quality(None, random=True, exposed=False) == []
 
