@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from workflows.programs.border import border_light
 from workflows.programs.program import Program
 from workflows.recovery.camera.clipped import bound_clipped
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry, fit_photometry
 from workflows.recovery.normalise import Conditions
 
@@ -27,41 +28,6 @@ Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 FrameOf = Callable[[int], tuple[Floats, Bools]]
 """Returns the light of a frame, (n, channels), and whether it is not clipped, by the frame's index."""
-
-
-class PatternLight(NamedTuple):
-    """The light of each pattern.
-
-    Attributes
-    ----------
-    values : (n, count, 3) float32
-        1 is full scale of the camera in the shortest exposure.
-    usable : (n, count, 3) bool
-        False where some frame of every exposure is clipped, at black or at white, and where there is no frame.
-    worth : (n, count, 3) float32
-        The number of frames of the shortest exposure that carry as much information.
-    """
-
-    values: Floats
-    usable: Bools
-    worth: Floats
-
-
-class Observations(NamedTuple):
-    """What T is recovered from.
-
-    Attributes
-    ----------
-    photometry : Photometry
-        S and rho of the n pixels.
-    values, usable, worth : (n, m, 3)
-        Those of `PatternLight`, of the m patterns that are measured; clipped values are bounds.
-    """
-
-    photometry: Photometry
-    values: Floats
-    usable: Bools
-    worth: Floats
 
 
 def clipped_from(stack: Stack) -> int:
@@ -309,17 +275,14 @@ def constants_of(attributes: dict[str, Any], program: Program) -> tuple[NDArray[
 
 def observe(
     light: PatternLight, attributes: dict[str, Any], program: Program, monitor: Curve
-) -> Observations:
-    """Fit S and rho to what pixels saw of constant patterns, and bound what is clipped of the others."""
-    noise, (values, usable, worth) = NoiseModel(**attributes["noise"]), light
+) -> tuple[Photometry, PatternLight]:
+    """Fit S and rho to what pixels saw of constant patterns, and bound what is clipped of those that are measured."""
+    noise = NoiseModel(**attributes["noise"])
     numbers, sent = constants_of(attributes, program)
-    photometry = fit_photometry(
-        values[:, numbers], to_light(sent, monitor), usable[:, numbers], noise, worth[:, numbers]
-    )
+    photometry = fit_photometry(light.of_patterns(numbers), to_light(sent, monitor), noise)
     shown = program.measured
     filmed = np.isin(shown, patterns_seen(attributes))
-    bounded = bound_clipped(values[:, shown], usable[:, shown], worth[:, shown], filmed, photometry, noise)
-    return Observations(photometry, *bounded)
+    return photometry, bound_clipped(light.of_patterns(shown), filmed, photometry, noise)
 
 
 def black_patterns(program: Program) -> NDArray[np.intp]:

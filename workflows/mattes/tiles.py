@@ -149,26 +149,22 @@ def recover_block(
     gain = gain_of(objects, capture)
     light, recovered = read_light(stack, span, program, gain, wanted)
     crosstalk = np.array(attributes["crosstalk"])
-    photometry, measurements, usable, worth = observe(light, attributes, program, monitor)
+    photometry, light = observe(light, attributes, program, monitor)
     places = places_in(span, recovered)
     method, conditions = options.of_method, conditions_of(stack, program)
     patterns = patterns_of(objects, capture)
     if isinstance(method, DgsrOptions):
         # Lobes find the light of a film's border, and fit S and rho to all frames.
-        found = lobes.recover(
-            measurements, photometry, patterns, noise, usable, worth, FAST, conditions, places
-        )
+        found = lobes.recover(light, photometry, patterns, noise, FAST, conditions, places)
         photometry = found.photometry
         if found.stray is not None:
-            measurements -= found.stray
+            light = light._replace(values=light.values - found.stray)
         sensing, constants = sensing_of(objects, capture), method.constants
-        transport = dgsr.recover(measurements, photometry, sensing, noise, usable, worth, method, conditions)
-        measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, worth)
+        transport = dgsr.recover(light, photometry, sensing, noise, method, conditions)
+        measured = normalise(light, photometry, noise, constants.least_contrast)
         error, least_weight = dgsr.composite_error(transport, photometry, measured, sensing), LEAST_WEIGHT
     else:
-        found = lobes.recover(
-            measurements, photometry, patterns, noise, usable, worth, method, conditions, places
-        )
+        found = lobes.recover(light, photometry, patterns, noise, method, conditions, places)
         transport, photometry, error = found.transport, found.photometry, found.error
         least_weight = method.least_weight
     if attributes.get("glare"):

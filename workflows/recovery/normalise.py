@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 
 # Standard deviations that S and S + rho may change by when they are fitted again.
@@ -53,29 +54,20 @@ class Measurements(NamedTuple):
 
 
 def normalise(
-    measurements: NDArray[np.float32],
-    photometry: Photometry,
-    noise: NoiseModel,
-    least_contrast: float,
-    usable: NDArray[np.bool_] | None = None,
-    worth: NDArray[np.number] | None = None,
+    light: PatternLight, photometry: Photometry, noise: NoiseModel, least_contrast: float
 ) -> Measurements:
-    """Convert measurements to the +-1 form of eq. 8.
+    """Convert camera values to the +-1 form of eq. 8.
 
     Parameters
     ----------
-    measurements : (n, m, 3) float32
-        Linear camera values C. Values that are not finite are ignored.
+    light : PatternLight
+        Of n pixels; its values are C.
     photometry : Photometry
         S and rho of the n pixels.
     noise : NoiseModel
         Noise of one frame.
     least_contrast : float
         A channel whose rho is below this many standard deviations of a mid-grey value is ignored.
-    usable : (n, m, 3) bool, optional
-        False where a value must be ignored, as where the camera clipped it. Default: all are usable.
-    worth : (m,) or (n, m, 3) number, optional
-        How many frames each value is worth, above 0: as many as were averaged into it, or fewer. Default: 1.
 
     Returns
     -------
@@ -92,26 +84,24 @@ def normalise(
 
     >>> S, rho, variance = (np.full((1, 3), value, np.float32) for value in (0.1, 0.5, 1e-6))
     >>> C = np.full((1, 3, 3), [[0.1], [0.35], [0.6]], np.float32)
-    >>> value, variance = normalise(C, Photometry(S, rho, variance, variance), NoiseModel(1e-5, 0), 3.0)
+    >>> photometry = Photometry(S, rho, variance, variance)
+    >>> value, variance = normalise(PatternLight.of(C), photometry, NoiseModel(1e-5, 0), 3.0)
     >>> print(value[0, 0].round(3), variance[0, 0].round(6))
     [-1.  0.  1. -1.  1.] [1.6e-04 1.6e-04 1.6e-04 1.6e-05 1.6e-05]
     """
-    n = photometry.rho.shape[0]
-    if measurements.ndim != 3 or measurements.shape[0] != n or measurements.shape[2] != 3:
-        raise ValueError(f"measurements must be ({n}, m, 3), not {measurements.shape}")
+    n, shape = photometry.rho.shape[0], light.values.shape
+    if len(shape) != 3 or shape[0] != n or shape[2] != 3:
+        raise ValueError(f"light must be ({n}, m, 3), not {shape}")
     rho, S = photometry.rho[..., None], photometry.S[..., None]
     alive = (rho > 0) & (rho**2 >= least_contrast**2 * noise.variance(S + rho / 2))
     scale = np.where(alive, rho, 1)
-    light = np.ascontiguousarray(measurements.transpose(0, 2, 1), dtype=np.float32)
-    valid = alive & np.isfinite(light)
-    if usable is not None:
-        valid &= usable.transpose(0, 2, 1)
-    light = np.where(valid, light, 0)
-    if worth is not None and worth.ndim == 3:
-        worth = worth.transpose(0, 2, 1)
-    variance = noise.variance(light) / (1 if worth is None else worth)
+    seen = np.ascontiguousarray(light.values.transpose(0, 2, 1), dtype=np.float32)
+    valid = alive & np.isfinite(seen)
+    valid &= light.usable.transpose(0, 2, 1)
+    seen = np.where(valid, seen, 0)
+    variance = noise.variance(seen) / light.worth.transpose(0, 2, 1)
     constant_variance = np.stack([photometry.black_variance, photometry.white_variance], axis=2)
-    value = np.where(valid, 2 * (light - S) / scale - 1, 0)
+    value = np.where(valid, 2 * (seen - S) / scale - 1, 0)
     variance = np.where(valid, 4 * variance / scale**2, np.inf)
     constants = np.where(alive, np.array([-1, 1], np.float32), 0)
     constant_variance = np.where(alive, 4 * constant_variance / scale**2, np.inf)

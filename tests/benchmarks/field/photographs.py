@@ -26,6 +26,7 @@ from workflows.images.tone_curves import to_light
 from workflows.ingest.measured_light import constants_of, read_light
 from workflows.mattes import tiles
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import fit_photometry
 from workflows.recovery.glare import add_glare
 
@@ -134,22 +135,21 @@ def _methods(
     attributes = stack.attributes
     program, monitor = tiles.program_of(objects, capture)
     whole = slice(0, stack.height), slice(0, stack.width)
-    (light, usable, worth), _ = read_light(stack, whole, program, tiles.gain_of(objects, capture))
-    light, usable, worth = light[chosen], usable[chosen], worth[chosen]
+    every, _ = read_light(stack, whole, program, tiles.gain_of(objects, capture))
+    light = every.of_pixels(chosen)
     noise = NoiseModel(**attributes["noise"])
     numbers, sent = constants_of(attributes, program)
-    levels = to_light(sent, monitor)
-    photometry = fit_photometry(light[:, numbers], levels, usable[:, numbers], noise, worth[:, numbers])
-    measurements = np.ascontiguousarray(light[:, program.measured])
+    photometry = fit_photometry(light.of_patterns(numbers), to_light(sent, monitor), noise)
+    measured = PatternLight.of(light.values[:, program.measured])  # the solvers leave nothing out
     glare = attributes.get("glare")
 
     def solved(solve: Recover) -> EngineMatte:
-        transport = solve(measurements, photometry, tiles.sensing_of(objects, capture), noise)
+        transport = solve(measured, photometry, tiles.sensing_of(objects, capture), noise)
         return EngineMatte(photometry, add_glare(transport, glare) if glare else transport)
 
     for name, solve in SOLVERS.items():
         yield name, lambda solve=solve: solved(solve)
-    shares = (measurements - photometry.S[:, None]) / np.maximum(photometry.rho, 1e-3)[:, None]
+    shares = (measured.values - photometry.S[:, None]) / np.maximum(photometry.rho, 1e-3)[:, None]
     drawn = list(program.pictures(0, program.count, stack.images()))
     pictures = [drawn[number] for number in program.measured]
     for name, widest in (("rectangles", None), ("one place", 1)):

@@ -33,6 +33,7 @@ from workflows.images.resample import area_mean
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.options import DgsrOptions
@@ -52,7 +53,7 @@ class Take:
     """Filmed pixels of a scene, as a recovery gets them, and the scene to score composites by."""
 
     scene: Any
-    measurements: NDArray[np.float32]
+    light: PatternLight
     photometry: Photometry
     sensing: Sensing
     noise: NoiseModel
@@ -75,20 +76,20 @@ def film(kit: ModuleType, scene: Any, bands: list[tuple[int, int, int]]) -> Take
     frames = [kit.sensor(light, rng, NOISE, "linear", DEPTH)[0] for light in kit.light(scene, described)]
     codes = np.stack(frames, axis=1)
     top = np.iinfo(codes.dtype).max
-    values, usable = codes.astype(np.float32) / np.float32(top), (codes > 0) & (codes < top)
+    every = PatternLight.of(codes.astype(np.float32) / np.float32(top), (codes > 0) & (codes < top))
     program = Program.model_validate(described)
     numbers, levels = program.constants
-    noise = estimate_noise(values[:, numbers], levels, usable[:, numbers], 1 / top)
-    once = np.ones(len(numbers), int)
-    photometry = fit_photometry(values[:, numbers], levels, usable[:, numbers], noise, once)
-    measurements = np.ascontiguousarray(values[:, program.measured])
-    return Take(scene, measurements, photometry, program.sensing("linear"), noise, program)
+    constant = every.of_patterns(numbers)
+    noise = estimate_noise(constant.values, levels, constant.usable, 1 / top)
+    photometry = fit_photometry(constant, levels, noise)
+    light = PatternLight.of(every.values[:, program.measured])  # the solvers leave nothing out
+    return Take(scene, light, photometry, program.sensing("linear"), noise, program)
 
 
 def measure(kit: ModuleType, take: Take, recover: Recover) -> dict[str, float]:
     """Recover, composite over every backdrop, score."""
     start = time.process_time()
-    T = recover(take.measurements, take.photometry, take.sensing, take.noise)
+    T = recover(take.light, take.photometry, take.sensing, take.noise)
     seconds = time.process_time() - start
     errors = _errors(
         kit,
@@ -97,7 +98,7 @@ def measure(kit: ModuleType, take: Take, recover: Recover) -> dict[str, float]:
         T.columns,
         T.rows,
     )
-    return errors | {"seconds": seconds / len(take.measurements) * 1000}
+    return errors | {"seconds": seconds / len(take.light.values) * 1000}
 
 
 def grid_errors(kit: ModuleType, scene: Any) -> dict[str, float]:
@@ -183,12 +184,12 @@ def table_2(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _lobes(
     patterns: Patterns,
-    measurements: NDArray[np.float32],
+    light: PatternLight,
     photometry: Photometry,
     sensing: Sensing,
     noise: NoiseModel,
 ) -> Transport:
-    return lobes.recover(measurements, photometry, patterns, noise).transport
+    return lobes.recover(light, photometry, patterns, noise).transport
 
 
 def methods(kit: ModuleType, scenes: dict[str, Any]) -> list[dict[str, Any]]:
@@ -257,7 +258,7 @@ def main() -> None:
     }
     # Compile before the clock starts.
     take = film(kit, next(iter(few.values())), [COARSE, (*FINE, 20)])
-    dgsr.recover(take.measurements, take.photometry, take.sensing, take.noise)
+    dgsr.recover(take.light, take.photometry, take.sensing, take.noise)
     measure(kit, take, partial(_lobes, lay_out(take.program, "linear")))
     tables = {}
     for name, title, run, of in (

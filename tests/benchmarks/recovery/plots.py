@@ -30,7 +30,8 @@ from workflows.programs.parts import Bernoulli
 from workflows.programs.presets import preset
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
-from workflows.recovery.camera.photometry import Photometry, estimate_noise, fit_photometry
+from workflows.recovery.camera.pattern_light import PatternLight
+from workflows.recovery.camera.photometry import estimate_noise, fit_photometry
 from workflows.recovery.lobes import recover as lobes
 
 matplotlib.use("Agg")
@@ -53,22 +54,19 @@ class Filmed:
             for picture in program.pictures(0, program.count)
         ]
         codes = np.stack(frames, axis=1)
-        self.light, self.usable = codes.astype(np.float32) / 255, (codes > 0) & (codes < 255)
+        self.light = PatternLight.of(codes.astype(np.float32) / 255, (codes > 0) & (codes < 255))
         self.numbers, self.sent = program.constants
-        self.noise = estimate_noise(
-            self.light[:, self.numbers], self.sent, self.usable[:, self.numbers], 1 / 255
-        )
+        constant = self.light.of_patterns(self.numbers)
+        self.noise = estimate_noise(constant.values, self.sent, constant.usable, 1 / 255)
         self.patterns = lay_out(program, "linear")
 
     def recover(self, pixels: int) -> tuple[lobes.Recovery, float]:
         """Recover the first pixels; also returns the seconds it took."""
-        constant, shown = self.numbers, self.program.measured
-        light, usable = self.light[:pixels], self.usable[:pixels]
-        photometry: Photometry = fit_photometry(
-            light[:, constant], self.sent, usable[:, constant], self.noise, np.ones(constant.size, int)
-        )
+        light = self.light.of_pixels(slice(pixels))
+        photometry = fit_photometry(light.of_patterns(self.numbers), self.sent, self.noise)
         start = time.process_time()
-        found = lobes.recover(light[:, shown], photometry, self.patterns, self.noise, usable[:, shown])
+        shown = light.of_patterns(self.program.measured)
+        found = lobes.recover(shown, photometry, self.patterns, self.noise)
         return found, time.process_time() - start
 
     def errors(self, found: lobes.Recovery) -> NDArray[np.float64]:

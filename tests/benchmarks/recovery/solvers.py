@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.dgsr.groups import Rows
 from workflows.recovery.normalise import normalise
 from workflows.recovery.sensing import Sensing
 from workflows.recovery.transport import Transport
 
-Recover = Callable[[NDArray[np.float32], Photometry, Sensing, NoiseModel], Transport]
+Recover = Callable[[PatternLight, Photometry, Sensing, NoiseModel], Transport]
 Solve = Callable[[NDArray[np.float64], NDArray[np.float64], float, int], NDArray[np.float64]]
 
 
@@ -28,10 +29,10 @@ def rival(solve: Solve, levels: str) -> Recover:
     """A method that solves for T pixel by pixel and channel by channel."""
 
     def recover(
-        measurements: NDArray[np.float32], photometry: Photometry, sensing: Sensing, noise: NoiseModel
+        light: PatternLight, photometry: Photometry, sensing: Sensing, noise: NoiseModel
     ) -> Transport:
-        measured = normalise(measurements, photometry, noise, 3.0)
-        index = np.arange(3 * len(measurements)).reshape(-1, 3)
+        measured = normalise(light, photometry, noise, 3.0)
+        index = np.arange(3 * len(light.values)).reshape(-1, 3)
         used = sensing.levels if levels == "hierarchical" else sensing.levels[-1:]
         rows = Rows.whole(index.size, used[0])
         for i, level in enumerate(used):

@@ -10,7 +10,6 @@ from tests.workflows.ingest.video.camera import film
 from tests.workflows.ingest.video.films import CAMERA, IngestFilm
 from workflows.images.tone_curves import table
 from workflows.ingest.measured_light import (
-    PatternLight,
     clipped_from,
     constants_of,
     merge,
@@ -20,6 +19,7 @@ from workflows.ingest.measured_light import (
 from workflows.programs.border import border_light
 from workflows.programs.presets import preset
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import fit_photometry
 
 LOOK_UP = table("linear", np.dtype(np.uint8))
@@ -96,9 +96,7 @@ def test_stray_light_of_constant_frames_is_what_s_and_rho_are_fitted_to() -> Non
     np.testing.assert_array_equal(strays[1:, :-2], lit[:, program.measured])
     numbers, sent = constants_of({"patterns": patterns, "border": True}, program)
     seen = np.repeat(0.1 + 0.3 * lit[:, numbers, np.newaxis], 3, axis=2) + 0.2 * sent
-    S, rho, *_ = fit_photometry(
-        seen, sent, np.ones(seen.shape, bool), NoiseModel(1e-6, 1e-4), np.ones(len(sent))
-    )
+    S, rho, *_ = fit_photometry(PatternLight.of(seen), sent, NoiseModel(1e-6, 1e-4))
     for channel in range(3):
         np.testing.assert_allclose(S[:, channel], 0.1 + 0.3 * strays[1:, -2], atol=1e-5)
         np.testing.assert_allclose((S + rho)[:, channel], 0.3 + 0.3 * strays[1:, -1], atol=1e-5)

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.pyramid import Pyramid
 from workflows.recovery.sensing import Level, Patterns, Sensing
@@ -15,7 +16,7 @@ Bands = list[tuple[int, int, int]]
 SensingOf = Callable[..., Sensing]
 PatternsOf = Callable[..., Patterns]
 Gaussian = Callable[..., NDArray[np.float64]]
-Scene = tuple[NDArray[np.float32], Photometry, NoiseModel]
+Scene = tuple[PatternLight, Photometry, NoiseModel]
 Observe = Callable[..., Scene]
 
 
@@ -59,7 +60,7 @@ def _gaussian(
 def _observe(
     shown: Sensing | Patterns, truth: NDArray[np.float64], rho: float | list[float] = 0.7, seed: int = 1
 ) -> Scene:
-    """Noisy measurements of true rows (n, 3, cells) on the finest grid."""
+    """Noisy light of true rows (n, 3, cells) on the finest grid."""
     rng = np.random.default_rng(seed)
     noise = NoiseModel(4e-6, 5e-5)
     S = np.full(truth.shape[:2], 0.02, np.float32)
@@ -74,14 +75,12 @@ def _observe(
     arrived = np.einsum("nci,cim->nmc", truth, light)
     clean = photometry.S[:, None] + photometry.rho[:, None] * arrived
     noisy = clean + np.sqrt(noise.variance(clean)) * rng.standard_normal(clean.shape)
-    return noisy.astype(np.float32), photometry, noise
+    return PatternLight.of(noisy.astype(np.float32)), photometry, noise
 
 
-def _spoil(
-    measurements: NDArray[np.float32], photometry: Photometry, far: float
-) -> tuple[NDArray[np.float32], Photometry]:
+def _spoil(light: PatternLight, photometry: Photometry, far: float) -> tuple[PatternLight, Photometry]:
     """Twelve pixels, each with something else that is wrong; of pixels 1, 9 and 10 nothing is left."""
-    measurements, S, rho = measurements.copy(), photometry.S.copy(), photometry.rho.copy()
+    measurements, S, rho = light.values.copy(), photometry.S.copy(), photometry.rho.copy()
     measurements[0, 3:40] = np.nan
     measurements[1] = np.nan
     measurements[2, 5] = np.inf
@@ -93,11 +92,11 @@ def _spoil(
     rho[8] = 1e-12
     S[9], rho[10] = np.nan, np.nan
     S[11] = 50
-    return measurements, photometry._replace(S=S, rho=rho)
+    return light._replace(values=measurements), photometry._replace(S=S, rho=rho)
 
 
 @pytest.fixture
-def spoil() -> Callable[..., tuple[NDArray[np.float32], Photometry]]:
+def spoil() -> Callable[..., tuple[PatternLight, Photometry]]:
     return _spoil
 
 

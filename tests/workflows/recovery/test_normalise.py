@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.normalise import (
     Measurements,
@@ -25,7 +26,7 @@ def photometry():
 
 def test_normalise_gives_the_signed_form_and_its_variance(photometry):
     measurements = np.array([[[0.1, 0.9, 0.1], [0.6, 0.5, 0.1]], [[0.3] * 3] * 2], np.float32)
-    value, variance = normalise(measurements, photometry, NOISE, 3.0)
+    value, variance = normalise(PatternLight.of(measurements), photometry, NOISE, 3.0)
     np.testing.assert_allclose(value[0], [[-1, 1, -1, 1], [1, 0, -1, 1], [0, 0, 0, 0]], atol=1e-6)
     np.testing.assert_allclose(value[1], [[0, 0, -1, 1]] * 3, atol=1e-6)
     seen = NOISE.variance(np.array([0.1, 0.6], np.float32))
@@ -40,7 +41,9 @@ def test_unusable_measurements_have_infinite_variance(photometry):
     measurements[1, :2, 0] = np.nan, np.inf
     usable = np.ones(measurements.shape, bool)
     usable[1, 2, 0] = False
-    value, variance = normalise(measurements, photometry, NOISE, 3.0, usable, np.array([1, 1, 1, 4]))
+    worth = np.ones(measurements.shape, np.float32)
+    worth[:, 3] = 4
+    value, variance = normalise(PatternLight(measurements, usable, worth), photometry, NOISE, 3.0)
     assert np.isinf(variance[1, 0]).tolist() == [True, True, True, False, False, False]
     assert (value[1, 0, :3] == 0).all()
     assert np.isfinite(variance[1, 1:]).all()
@@ -48,9 +51,11 @@ def test_unusable_measurements_have_infinite_variance(photometry):
     np.testing.assert_allclose(variance[1, 1, 3], variance[1, 1, 0] / 4, rtol=1e-6)
 
 
-def test_measurements_of_other_pixels_are_refused(photometry):
-    with pytest.raises(ValueError, match="measurements"):
-        normalise(np.zeros((len(photometry.S) + 1, 8, 3), np.float32), photometry, NOISE, 3.0)
+def test_light_of_other_pixels_are_refused(photometry):
+    with pytest.raises(ValueError, match="light must be"):
+        normalise(
+            PatternLight.of(np.zeros((len(photometry.S) + 1, 8, 3), np.float32)), photometry, NOISE, 3.0
+        )
 
 
 def test_refit_is_weighted_least_squares_in_camera_values(photometry):
@@ -67,7 +72,7 @@ def test_refit_is_weighted_least_squares_in_camera_values(photometry):
     measurements = 0.01 + photometry.S[:, None] + 0.97 * photometry.rho[:, None] * light
     measurements += rng.normal(0, 0.01, measurements.shape)
     measurements[1, 3] = np.nan
-    measured = normalise(measurements.astype(np.float32), photometry, NOISE, 3.0)
+    measured = normalise(PatternLight.of(measurements.astype(np.float32)), photometry, NOISE, 3.0)
     fit = refit_photometry(photometry, measured, response, kappa)
     for p, c in [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]:
         light = (1 + response[p, c].astype(float)) / 2

@@ -15,7 +15,6 @@ from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import (
-    PatternLight,
     clipped_from,
     conditions_of,
     even_out,
@@ -28,6 +27,7 @@ from workflows.ingest.measured_light import (
 )
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import MEDIAN_TO_SIGMA, NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.lobes.recover import Recovery, recover
@@ -274,22 +274,20 @@ def recover_seen(
     attributes = stack.attributes | {"gains": np.exp(gains).tolist() if gains.any() else None}
     noise = NoiseModel(**attributes["noise"])
     found = light_of(lambda n: (seen.values[n], seen.whole[n]), attributes, program, seen.values.shape[1])
-    photometry, measurements, used, worth = observe(found, attributes, program, monitor)
+    photometry, light = observe(found, attributes, program, monitor)
     alive = photometry.rho**2 > CONTRAST**2 * noise.variance(photometry.S + photometry.rho / 2)
     if np.count_nonzero(alive.any(axis=1)) < MIN_PIXELS:
         return None
     conditions = conditions_of(stack, program)
-    used[:, held_out] = False
-    n = len(measurements)
+    light.usable[:, held_out] = False
+    n = len(light.values)
     firsts = range(0, n, n if places is not None else ALONE)
     parts: dict[int, Recovery] = {}
 
     def recover_part(first: int) -> None:
         at = slice(first, first + firsts.step)
         of_part = Photometry(*(values[at] for values in photometry))
-        parts[first] = recover(
-            measurements[at], of_part, patterns, noise, used[at], worth[at], options, conditions, places
-        )
+        parts[first] = recover(light.of_pixels(at), of_part, patterns, noise, options, conditions, places)
 
     in_parts(recover_part, firsts, CORES)
     made = _joined([parts[first] for first in firsts])

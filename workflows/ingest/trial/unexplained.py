@@ -148,19 +148,15 @@ class Rest:
         at = slice(None, channels)
         first = {pattern: frame for frame, pattern in reversed(list(enumerate(stack.attributes["patterns"])))}
         self.frames = np.array([first.get(pattern, 0) for pattern in shown.tolist()])
-        light, usable, worth = (
-            found.light.values[:, shown],
-            found.light.usable[:, shown],
-            found.light.worth[:, shown],
-        )
-        measured = normalise(light, found.photometry, noise, CONTRAST, usable, worth)
+        light = found.light.of_patterns(shown)
+        measured = normalise(light, found.photometry, noise, CONTRAST)
         value, self.variance = (part[:, at, :-2] for part in measured)
         self.plain, seen = (predict(found.transport, p)[:, at] for p in (patterns, through))
         self.known = (
             np.isfinite(self.variance) & (found.transport.count.sum(axis=1) > 0)[:, np.newaxis, np.newaxis]
         )
         self.rho = np.broadcast_to(found.photometry.rho[:, at, np.newaxis], value.shape)
-        self.worth = worth.transpose(0, 2, 1)[:, at]
+        self.worth = light.worth.transpose(0, 2, 1)[:, at]
         # Not as measured: then values of a bin would have been chosen by their noise.
         self.level = found.photometry.S[:, at, np.newaxis] + self.rho * (1 + seen) / 2
         strays = found.strays[1:, :-2]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.recovery.camera.noise import LEAST_READ, LEAST_SAMPLES, NoiseModel, fit_noise
+from workflows.recovery.camera.pattern_light import PatternLight
 
 TYPICAL_SHOT = 1 / 20_000
 """Shot noise of a full well of 20,000 electrons."""
@@ -47,27 +48,17 @@ class Photometry(NamedTuple):
     white_variance: NDArray[np.float32]
 
 
-def fit_photometry(
-    values: NDArray[np.float32],
-    levels: NDArray[np.float32],
-    usable: NDArray[np.bool_],
-    noise: NoiseModel,
-    worth: NDArray[np.number],
-) -> Photometry:
+def fit_photometry(light: PatternLight, levels: NDArray[np.float32], noise: NoiseModel) -> Photometry:
     """Fit S and rho to frames of constant monitors.
 
     Parameters
     ----------
-    values : (n, k, 3) float32
-        Linear camera values of n pixels under k constant monitors.
+    light : PatternLight
+        Of n pixels under k constant monitors.
     levels : (k, 3) float32
         Light of each monitor by channel, 0 to 1.
-    usable : (n, k, 3) bool
-        False where a value must be ignored, as where the camera clipped it.
     noise : NoiseModel
         Noise of one frame.
-    worth : (k,) or (n, k, 3) number
-        How many frames each value is worth, above 0; a longer exposure counts as several.
 
     Returns
     -------
@@ -89,15 +80,15 @@ def fit_photometry(
     --------
     >>> values = np.full((1, 2, 3), [[0.1], [0.7]], np.float32)
     >>> levels = np.full((2, 3), [[0], [1]], np.float32)
-    >>> found = fit_photometry(values, levels, values > 0, NoiseModel(1e-6, 0), np.ones(2))
+    >>> found = fit_photometry(PatternLight.of(values), levels, NoiseModel(1e-6, 0))
     >>> print(found.S.round(3), found.rho.round(3))
     [[0.1 0.1 0.1]] [[0.6 0.6 0.6]]
     """
+    values, usable, worth = light
     _check_shapes(values, levels, usable)
     if (np.ptp(levels, axis=0) == 0).any():
         raise ValueError("every channel needs at least two different constant levels")
-    of_value = worth[:, None] if worth.ndim == 1 else worth
-    used = np.where(_select_values(levels, usable), of_value, 0).astype(np.float64)
+    used = np.where(_select_values(levels, usable), worth, 0).astype(np.float64)
     S, rho, *_ = _fit_line(values, levels, used)
     weight = used / noise.variance(S[:, None] + rho[:, None] * levels)
     return Photometry(*(array.astype(np.float32) for array in _fit_line(values, levels, weight)))

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.dgsr.gaussian_prior import filter_rows
 from workflows.recovery.dgsr.groups import Rows
@@ -29,12 +30,10 @@ _MOST_DEVIATION = 1e3
 
 
 def recover(
-    measurements: NDArray[np.float32],
+    light: PatternLight,
     photometry: Photometry,
     sensing: Sensing,
     noise: NoiseModel,
-    usable: NDArray[np.bool_] | None = None,
-    worth: NDArray[np.number] | None = None,
     options: DgsrOptions = DEFAULT,
     conditions: Conditions = PLAIN,
 ) -> Transport:
@@ -42,18 +41,14 @@ def recover(
 
     Parameters
     ----------
-    measurements : (n, m, 3) float32
-        Linear camera values of n pixels under the m patterns. Values that are not finite are ignored.
+    light : PatternLight
+        Of n pixels under the m patterns.
     photometry : Photometry
         S and rho of the pixels.
     sensing : Sensing
         The program's levels, coarse to fine.
     noise : NoiseModel
         Noise of one frame.
-    usable : (n, m, 3) bool, optional
-        False where a measurement must be ignored, as where the camera clipped it. Default: all are usable.
-    worth : (m,) or (n, m, 3) number, optional
-        How many frames each measurement is worth, above 0: as many as were averaged into it, or fewer. Default: 1.
     options : DgsrOptions
     conditions : Conditions
         Without stray light, which must have been subtracted.
@@ -92,20 +87,20 @@ def recover(
     A pixel that sees one cell of a grid of 8 x 6 through the glass, under 40 random patterns:
 
     >>> from workflows.recovery.sensing import Level
-    >>> light = np.random.default_rng(0).integers(0, 2, (1, 48, 40)).astype(np.float32)
-    >>> sensing = Sensing((Level(8, 6, np.arange(40), light),))
+    >>> shown = np.random.default_rng(0).integers(0, 2, (1, 48, 40)).astype(np.float32)
+    >>> sensing = Sensing((Level(8, 6, np.arange(40), shown),))
     >>> S, rho, variance = (np.full((1, 3), value, np.float32) for value in (0.1, 0.7, 1e-6))
-    >>> measurements = (S + rho * light[0, 21, :, np.newaxis])[np.newaxis]
+    >>> values = (S + rho * shown[0, 21, :, np.newaxis])[np.newaxis]
     >>> photometry = Photometry(S, rho, variance, variance)
-    >>> transport = recover(measurements, photometry, sensing, NoiseModel(1e-6, 0))
+    >>> transport = recover(PatternLight.of(values), photometry, sensing, NoiseModel(1e-6, 0))
     >>> transport.cell.tolist(), transport.weight.tolist()
     ([21, 21, 21], [1.0, 1.0, 1.0])
     """
     constants = options.constants
     needed = 1 + max(int(level.patterns.max()) for level in sensing.levels)
-    if measurements.shape[1] < needed:
-        raise ValueError(f"measurements are of {measurements.shape[1]} patterns, the levels have {needed}")
-    measured = normalise(measurements, photometry, noise, constants.least_contrast, usable, worth)
+    if light.values.shape[1] < needed:
+        raise ValueError(f"light is of {light.values.shape[1]} patterns, the levels have {needed}")
+    measured = normalise(light, photometry, noise, constants.least_contrast)
     measured = add_model_error(measured, conditions.model_error)
     value, weight = _weight_measurements(measured.value[..., :-2], measured.variance[..., :-2])
     parts = []

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.fitting.averages import KEPT, adjacent, average_fits
 from workflows.recovery.lobes.fitting.channels import disputed, share_of_separate
@@ -56,12 +57,10 @@ class Recovery(NamedTuple):
 
 
 def recover(
-    measurements: NDArray[np.float32],
+    light: PatternLight,
     photometry: Photometry,
     patterns: Patterns,
     noise: NoiseModel,
-    usable: NDArray[np.bool_] | None = None,
-    worth: NDArray[np.number] | None = None,
     options: LobesOptions = FINE,
     conditions: Conditions = PLAIN,
     places: NDArray[np.integer] | None = None,
@@ -70,18 +69,14 @@ def recover(
 
     Parameters
     ----------
-    measurements : (n, m, 3) float32
-        Linear camera values of n pixels under the m patterns. Values that are not finite are ignored.
+    light : PatternLight
+        Of n pixels under the m patterns.
     photometry : Photometry
         S and rho of the pixels, from constant monitors.
     patterns : Patterns
         The patterns' light on a pyramid over the monitor.
     noise : NoiseModel
         Noise of one frame.
-    usable : (n, m, 3) bool, optional
-        False where a value must be ignored, as where the camera clipped it. Default: all are usable.
-    worth : (m,) or (n, m, 3) number, optional
-        How many frames each value is worth, above 0: as many as were averaged into it, or fewer. Default: 1.
     options : LobesOptions
     conditions : Conditions
     places : (n, 2) int, optional
@@ -117,30 +112,30 @@ def recover(
     >>> pyramid = Pyramid.over(8, 6)
     >>> code = np.random.default_rng(0).integers(0, 2, (pyramid.nodes, 40)).astype(np.uint8) * np.uint8(255)
     >>> S, rho, variance = (np.full((1, 3), value, np.float32) for value in (0.1, 0.7, 1e-6))
-    >>> measurements = (S + rho * code[21, :, np.newaxis] / 255).astype(np.float32)[np.newaxis]
+    >>> values = (S + rho * code[21, :, np.newaxis] / 255).astype(np.float32)[np.newaxis]
     >>> patterns = Patterns(pyramid, 1, code)
-    >>> found = recover(measurements, Photometry(S, rho, variance, variance), patterns, NoiseModel(1e-6, 0))
-    >>> light = np.zeros((pyramid.nodes, 3), np.float32)
-    >>> light[21] = 1
-    >>> print(found.transport.apply(light).round(2))
+    >>> photometry = Photometry(S, rho, variance, variance)
+    >>> found = recover(PatternLight.of(values), photometry, patterns, NoiseModel(1e-6, 0))
+    >>> backdrop = np.zeros((pyramid.nodes, 3), np.float32)
+    >>> backdrop[21] = 1
+    >>> print(found.transport.apply(backdrop).round(2))
     [[1. 1. 1.]]
     """
-    n, m = len(measurements), patterns.count
-    if measurements.shape != (n, m, 3):
-        raise ValueError(f"measurements must be (n, {m}, 3), not {measurements.shape}")
+    n, m = len(light.values), patterns.count
+    if light.values.shape != (n, m, 3):
+        raise ValueError(f"light must be (n, {m}, 3), not {light.values.shape}")
     if len(patterns.code) != patterns.pyramid.nodes:
         raise ValueError(f"patterns have {len(patterns.code)} nodes, their pyramid {patterns.pyramid.nodes}")
     strays = np.ones((1, m + 2), np.float32) if conditions.strays is None else conditions.strays
     if strays.ndim != 2 or strays.shape[1] != m + 2:
         raise ValueError(f"strays must be (s, {m + 2}), not {strays.shape}")
     if conditions.grey:
-        usable = np.ones(measurements.shape, bool) if usable is None else usable.copy()
-        usable[:, :, 1:] = False
+        light = light._replace(usable=light.usable & (np.arange(3) == 0))
     stray: NDArray[np.float32] | None = None
     if len(strays) > 1:
-        stray, photometry = find_strong_strays(measurements, photometry, strays, usable, worth)
-        measurements = measurements - stray
-    measured = normalise(measurements, photometry, noise, options.least_contrast, usable, worth)
+        stray, photometry = find_strong_strays(light, photometry, strays)
+        light = light._replace(values=light.values - stray)
+    measured = normalise(light, photometry, noise, options.least_contrast)
     counts = np.zeros((n, 3), np.int64)
     found = Diagnostics(
         np.zeros_like(measured.value),

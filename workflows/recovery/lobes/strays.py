@@ -5,6 +5,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.special import betaincinv
 
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry, solve_least_squares
 
 STRAY = 0.1
@@ -16,26 +17,17 @@ SURE = 0.993
 
 
 def find_strong_strays(
-    measurements: NDArray[np.float32],
-    photometry: Photometry,
-    strays: NDArray[np.float32],
-    usable: NDArray[np.bool_] | None,
-    worth: NDArray[np.number] | None,
+    light: PatternLight, photometry: Photometry, strays: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], Photometry]:
     """Find the stray light of pixels that see more of it than of the patterns, as those that see a film's border.
 
     Parameters
     ----------
-    measurements : (n, m, 3) float32
-        Linear camera values under the patterns.
+    light : PatternLight
     photometry : Photometry
         From constant monitors.
     strays : (s, m + 2) float32
         As in :class:`~workflows.recovery.normalise.Conditions`; the first is constant.
-    usable : (n, m, 3) bool or None
-        False where a value must be ignored.
-    worth : (m,) or (n, m, 3) number, or None
-        How many frames a value is worth.
 
     Returns
     -------
@@ -50,20 +42,19 @@ def find_strong_strays(
     to black and white, whose weight is the inverse of their variances. What patterns show besides is like noise here,
     of the variance that is left.
     """
-    m = measurements.shape[1]
-    light = np.stack([photometry.S, photometry.S + photometry.rho], axis=2)
-    values = np.concatenate([measurements.transpose(0, 2, 1), light], axis=2).astype(np.float64)
+    seen, usable, worth = (array.transpose(0, 2, 1) for array in light)
+    m = seen.shape[2]
+    constants = np.stack([photometry.S, photometry.S + photometry.rho], axis=2)
+    values = np.concatenate([seen, constants], axis=2).astype(np.float64)
     known = np.isfinite(values)
-    if usable is not None:
-        known[:, :, :m] &= usable.transpose(0, 2, 1)
+    known[:, :, :m] &= usable
     values = np.where(known, values, 0)
     half = np.concatenate([np.full(m, 0.5), [0, 1]])
     design = np.concatenate([strays[:1], half[np.newaxis], strays[1:]]).T.astype(np.float64)
     weight = known.astype(np.float64)
     weight[:, :, m:] = 0
-    if worth is not None and worth.ndim == 3:
-        # Of values that are bounds little is known: they must not look like the border's light.
-        weight[:, :, :m] *= (worth / worth.max(axis=1, keepdims=True)).transpose(0, 2, 1)
+    # Of values that are bounds little is known: they must not look like the border's light.
+    weight[:, :, :m] *= worth / worth.max(axis=2, keepdims=True)
     count = np.maximum(weight.sum(axis=2, keepdims=True), 1)
     before = (weight * (values - (weight * values).sum(axis=2, keepdims=True) / count) ** 2).sum(axis=2)
     alone = np.delete(design, 1, axis=1)
@@ -80,7 +71,7 @@ def find_strong_strays(
         [photometry.black_variance[strong], photometry.white_variance[strong]], axis=1
     )
     found, covariance = solve_least_squares(design, weight, values)
-    stray = np.zeros(measurements.transpose(0, 2, 1).shape, np.float32)
+    stray = np.zeros(seen.shape, np.float32)
     stray[strong] = found[:, 2:] @ design[:m, 2:].T
     S, rho = found[:, 0], found[:, 1]
     white = np.array([1.0, 1.0])

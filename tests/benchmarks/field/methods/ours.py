@@ -13,6 +13,7 @@ from workflows.programs.parts import Bernoulli, Constant, Monitor
 from workflows.programs.presets import preset
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry, estimate_noise, fit_photometry
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.pyramid import Pyramid
@@ -68,15 +69,15 @@ class Engine:
         yield np.round(255 * stacked).astype(np.uint8)
 
     def recover(self, film: Film) -> Matte:
-        usable = (film.values > 0) & (film.values < 1)
+        light = PatternLight.of(film.values, (film.values > 0) & (film.values < 1))
         numbers, levels = self.shown.constants
-        constant, clear = film.values[:, numbers], usable[:, numbers]
-        noise = estimate_noise(constant, levels, clear, film.step)
-        photometry = fit_photometry(constant, levels, clear, noise, np.ones(len(numbers), int))
-        measured = np.ascontiguousarray(film.values[:, self.shown.measured])
+        constant, measured = light.of_patterns(numbers), light.of_patterns(self.shown.measured)
+        noise = estimate_noise(constant.values, levels, constant.usable, film.step)
+        photometry = fit_photometry(constant, levels, noise)
         if self.solve is None:
             patterns = lay_out(self.shown, "linear")
-            found = lobes.recover(measured, photometry, patterns, noise, usable[:, self.shown.measured])
+            found = lobes.recover(measured, photometry, patterns, noise)
             return EngineMatte(photometry, found.transport)
-        T = self.solve(measured, photometry, self.shown.sensing("linear"), noise)
+        every = PatternLight.of(measured.values)  # the solvers leave nothing out
+        T = self.solve(every, photometry, self.shown.sensing("linear"), noise)
         return EngineMatte(photometry, cast(Transport, T))

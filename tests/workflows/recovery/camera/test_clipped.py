@@ -4,6 +4,7 @@ import numpy as np
 
 from workflows.recovery.camera.clipped import DEVIATION, NARROWEST, bound_clipped
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 
 NOISE = NoiseModel(1e-6, 0)
@@ -14,14 +15,12 @@ def bounded(values: list[float], usable: list[bool], filmed: list[bool]) -> list
     """Values of one pixel, alike in its channels, after `bound_clipped`: (m,) each."""
     m = len(values)
     of_pixel = [np.full((1, 3), value, np.float32) for value in (S, RHO, 1e-6, 1e-6)]
-    found = bound_clipped(
+    light = PatternLight(
         np.repeat(np.array(values, np.float32)[np.newaxis, :, np.newaxis], 3, axis=2),
         np.repeat(np.array(usable)[np.newaxis, :, np.newaxis], 3, axis=2),
         np.full((1, m, 3), 2, np.float32),
-        np.array(filmed),
-        Photometry(*of_pixel),
-        NOISE,
     )
+    found = bound_clipped(light, np.array(filmed), Photometry(*of_pixel), NOISE)
     for one in found:
         np.testing.assert_array_equal(one, np.repeat(one[..., :1], 3, axis=2))
     return [one[0, :, 0] for one in found]

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import estimate_crosstalk, estimate_noise, fit_photometry
 
 NOISE = NoiseModel(4e-6, 5e-5)
@@ -19,7 +20,8 @@ def constants(n, k=8, noise=NOISE, seed=0, frames=1):
 def test_fit_is_weighted_least_squares():
     values, levels, S, rho = constants(5)
     frames = np.array([1, 2, 1, 4, 1, 1, 3, 1])
-    fit = fit_photometry(values, levels, np.ones(values.shape, bool), NOISE, frames)
+    worth = np.broadcast_to(frames[:, None], values.shape).astype(np.float32)
+    fit = fit_photometry(PatternLight.of(values)._replace(worth=worth), levels, NOISE)
     for p in range(5):
         for c in range(3):
             design = np.stack([np.ones(8), levels[:, c]], axis=1)
@@ -41,7 +43,7 @@ def test_lit_and_dark_parts_of_a_border_weigh_alike():
     black, white = [0.02, 0.48, 0.48], [0.23, 0.69, 0.69]
     values = np.repeat(np.array(black + white, np.float32)[np.newaxis, :, np.newaxis], 3, axis=2)
     levels = np.repeat(np.repeat([0, 1], 3)[:, np.newaxis], 3, axis=1).astype(np.float32)
-    fit = fit_photometry(values, levels, np.ones(values.shape, bool), NOISE, np.ones(6))
+    fit = fit_photometry(PatternLight.of(values), levels, NOISE)
     np.testing.assert_allclose(fit.S, np.mean(black), atol=1e-6)
     np.testing.assert_allclose(fit.S + fit.rho, np.mean(white), atol=1e-6)
 
@@ -52,9 +54,8 @@ def test_clipped_levels_are_left_out():
     usable[:, 6:, 1] = False
     clipped = values.copy()
     clipped[:, 6:, 1] = 0.1
-    frames = np.ones(8, int)
-    expected = fit_photometry(values[:, :6], levels[:6], usable[:, :6], NOISE, frames[:6])
-    fit = fit_photometry(clipped, levels, usable, NOISE, frames)
+    expected = fit_photometry(PatternLight.of(values[:, :6]), levels[:6], NOISE)
+    fit = fit_photometry(PatternLight.of(clipped, usable), levels, NOISE)
     np.testing.assert_allclose(fit.rho[:, 1], expected.rho[:, 1], rtol=1e-6)
 
 
@@ -62,29 +63,22 @@ def test_all_levels_serve_where_fewer_than_two_usable_ones_differ():
     values, levels, _, _ = constants(1)
     usable = np.zeros(values.shape, bool)
     usable[:, 3] = True
-    frames = np.ones(8, int)
-    fit = fit_photometry(values, levels, usable, NOISE, frames)
-    whole = fit_photometry(values, levels, np.ones_like(usable), NOISE, frames)
+    fit = fit_photometry(PatternLight.of(values, usable), levels, NOISE)
+    whole = fit_photometry(PatternLight.of(values), levels, NOISE)
     np.testing.assert_array_equal(fit.rho, whole.rho)
 
 
 def test_a_dead_channel_has_rho_zero_and_the_mean_as_s():
     values, levels, _, _ = constants(1)
     values[0, :, 2] = np.linspace(0.04, 0.02, 8)
-    fit = fit_photometry(values, levels, np.ones(values.shape, bool), NoiseModel(1e-6, 0), np.ones(8, int))
+    fit = fit_photometry(PatternLight.of(values), levels, NoiseModel(1e-6, 0))
     assert fit.rho[0, 2] == 0
     assert fit.S[0, 2] == pytest.approx(0.03)
 
 
 def test_one_level_is_refused():
     with pytest.raises(ValueError, match="two different"):
-        fit_photometry(
-            np.ones((1, 2, 3), np.float32),
-            np.ones((2, 3), np.float32),
-            np.ones((1, 2, 3), bool),
-            NOISE,
-            np.ones(2, int),
-        )
+        fit_photometry(PatternLight.of(np.ones((1, 2, 3), np.float32)), np.ones((2, 3), np.float32), NOISE)
 
 
 def test_shapes_that_do_not_fit_are_refused():

@@ -42,11 +42,9 @@ def errors(found, truth):
 def test_the_prior_cuts_the_error_of_lobes_from_few_measurements(sensing_of, observe, lobes):
     truth = lobes(12, 1)
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 60)], 3)
-    measurements, photometry, noise = observe(sensing, truth)
-    plain = errors(
-        dgsr.recover(measurements, photometry, sensing, noise, options=DgsrOptions(prior="none")), truth
-    )
-    filtered = errors(dgsr.recover(measurements, photometry, sensing, noise), truth)
+    light, photometry, noise = observe(sensing, truth)
+    plain = errors(dgsr.recover(light, photometry, sensing, noise, DgsrOptions(prior="none")), truth)
+    filtered = errors(dgsr.recover(light, photometry, sensing, noise), truth)
     assert filtered.mean() < 0.5 * plain.mean()
 
 
@@ -54,50 +52,31 @@ def test_the_prior_leaves_a_t_of_few_cells_alone(sensing_of, observe):
     truth = np.zeros((1, 3, ROWS * COLUMNS))
     truth[:, :, [70, 400, 640, 705]] = [0.4, 0.3, 0.2, 0.1]  # more than there may be clusters
     sensing = sensing_of([(8, 6, 40), (COLUMNS, ROWS, 120)], 4)
-    scene = observe(sensing, truth)
-    found = rows_of(dgsr.recover(scene[0], scene[1], sensing, scene[2]))
+    light, photometry, noise = observe(sensing, truth)
+    found = rows_of(dgsr.recover(light, photometry, sensing, noise))
     assert np.abs(found - truth).sum(2).max() < 0.1
 
 
 def test_what_fits_no_gaussian_is_taken_out(sensing_of, observe, lobes):
     truth = lobes(6, 2)
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 60)], 5)
-    scene = observe(sensing, truth)
-    near = (
-        rows_of(
-            dgsr.recover(
-                scene[0], scene[1], sensing, scene[2], options=DgsrOptions(constants=Constants(reach=2.0))
-            )
-        )
-        > 0
-    )
-    far = (
-        rows_of(
-            dgsr.recover(
-                scene[0], scene[1], sensing, scene[2], options=DgsrOptions(constants=Constants(reach=4.0))
-            )
-        )
-        > 0
-    )
-    assert near.sum() < 0.7 * far.sum()
+    light, photometry, noise = observe(sensing, truth)
+
+    def cells(reach):
+        options = DgsrOptions(constants=Constants(reach=reach))
+        return (rows_of(dgsr.recover(light, photometry, sensing, noise, options)) > 0).sum()
+
+    assert cells(2.0) < 0.7 * cells(4.0)
 
 
 def test_one_cluster_is_all_there_may_be(sensing_of, observe, lobes):
     truth = lobes(3, 1)[1:2]  # two lobes
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 60)], 3)
-    measurements, photometry, noise = observe(sensing, truth)
+    light, photometry, noise = observe(sensing, truth)
 
     def error(clusters):
-        return errors(
-            dgsr.recover(
-                measurements,
-                photometry,
-                sensing,
-                noise,
-                options=DgsrOptions(constants=Constants(clusters=clusters)),
-            ),
-            truth,
-        ).mean()
+        options = DgsrOptions(constants=Constants(clusters=clusters))
+        return errors(dgsr.recover(light, photometry, sensing, noise, options), truth).mean()
 
     assert error(2) < 0.5 * error(1)
 
@@ -109,15 +88,15 @@ def test_one_cluster_is_all_there_may_be(sensing_of, observe, lobes):
 def test_bad_input_gives_finite_rows(spoil, sensing_of, observe, prior, channels, levels, colours, lobes):
     truth = lobes(12, 7)
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 40)], 6, channels=colours)
-    measurements, photometry, noise = observe(sensing, truth)
-    measurements, photometry = spoil(measurements, photometry, -1e30)
+    light, photometry, noise = observe(sensing, truth)
+    light, photometry = spoil(light, photometry, -1e30)
     options = DgsrOptions(prior, levels, channels, Constants(least_contrast=0.0))
-    found = dgsr.recover(measurements, photometry, sensing, noise, options=options)
+    found = dgsr.recover(light, photometry, sensing, noise, options)
     assert np.isfinite(found.weight).all()
     assert (found.count[[1, 9, 10]] == 0).all()
     assert found.count[5, 1] == 0
     assert (found.count[5, [0, 2]] > 0).all()
-    clean = dgsr.recover(*observe(sensing, truth)[:2], sensing, noise, options=options)
+    clean = dgsr.recover(*observe(sensing, truth)[:2], sensing, noise, options)
     np.testing.assert_allclose(rows_of(found)[2:4] @ COLUMN, rows_of(clean)[2:4] @ COLUMN, atol=1.5)
 
 
@@ -126,8 +105,8 @@ def test_bad_input_gives_finite_rows(spoil, sensing_of, observe, prior, channels
 def test_a_program_too_small_gives_finite_rows(sensing_of, observe, prior, bands, lobes):
     truth = lobes(3, 8)
     sensing = sensing_of(bands, 2)
-    measurements, photometry, noise = observe(sensing, truth)
-    found = dgsr.recover(measurements, photometry, sensing, noise, options=DgsrOptions(prior=prior))
+    light, photometry, noise = observe(sensing, truth)
+    found = dgsr.recover(light, photometry, sensing, noise, DgsrOptions(prior=prior))
     assert np.isfinite(found.weight).all()
 
 
@@ -137,29 +116,29 @@ def test_patterns_that_are_all_the_same(sensing_of, observe, prior, light, lobes
     sensing = sensing_of([(8, 6, 4), (COLUMNS, ROWS, 20)], 2)
     for level in sensing.levels:
         level.light[:] = light
-    measurements, photometry, noise = observe(sensing, lobes(3, 8))
-    found = dgsr.recover(measurements, photometry, sensing, noise, options=DgsrOptions(prior=prior))
+    light, photometry, noise = observe(sensing, lobes(3, 8))
+    found = dgsr.recover(light, photometry, sensing, noise, DgsrOptions(prior=prior))
     assert np.isfinite(found.weight).all()
 
 
 def test_joint_channels_share_a_t_and_use_every_measurement(sensing_of, observe, lobes):
     truth = lobes(8, 4)
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 40)], 8, channels=3)
-    measurements, photometry, noise = observe(sensing, truth, rho=[0.9, 0.3, 0.5])
-    joint = dgsr.recover(measurements, photometry, sensing, noise, options=DgsrOptions(channels="joint"))
+    light, photometry, noise = observe(sensing, truth, rho=[0.9, 0.3, 0.5])
+    joint = dgsr.recover(light, photometry, sensing, noise, DgsrOptions(channels="joint"))
     np.testing.assert_array_equal(rows_of(joint)[:, 0], rows_of(joint)[:, 2])
-    apart = dgsr.recover(measurements, photometry, sensing, noise)
+    apart = dgsr.recover(light, photometry, sensing, noise)
     assert errors(joint, truth).mean() < 0.7 * errors(apart, truth).mean()
 
 
 def test_what_the_camera_clipped_is_left_out(sensing_of, observe, lobes):
     truth = lobes(6, 4)
     sensing = sensing_of([(8, 6, 24), (COLUMNS, ROWS, 60)], 9)
-    measurements, photometry, noise = observe(sensing, truth)
-    usable = np.ones(measurements.shape, bool)
+    light, photometry, noise = observe(sensing, truth)
+    usable = light.usable.copy()
     usable[:, 5::6] = False
-    clean = errors(dgsr.recover(measurements, photometry, sensing, noise), truth).mean()
-    measurements[~usable] = 1
-    kept = errors(dgsr.recover(measurements, photometry, sensing, noise), truth).mean()
-    left_out = errors(dgsr.recover(measurements, photometry, sensing, noise, usable), truth).mean()
+    clean = errors(dgsr.recover(light, photometry, sensing, noise), truth).mean()
+    light.values[~usable] = 1
+    kept = errors(dgsr.recover(light, photometry, sensing, noise), truth).mean()
+    left_out = errors(dgsr.recover(light._replace(usable=usable), photometry, sensing, noise), truth).mean()
     assert left_out < 3 * clean < kept

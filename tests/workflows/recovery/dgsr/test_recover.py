@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.options import DgsrOptions
@@ -113,12 +114,12 @@ def test_patterns_of_three_colours(recover, sensing_of, observe):
 def test_result_does_not_depend_on_the_batch(recover, sensing_of, observe, colours):
     truth = np.concatenate([mixture(), lobe(12.0, 12.5, 2.5, 1.2, 0.3)])
     sensing = sensing_of(BANDS, 6, channels=colours)
-    measurements, photometry, noise = observe(sensing, truth)
-    whole = recover(measurements, photometry, sensing, noise)
+    light, photometry, noise = observe(sensing, truth)
+    whole = recover(light, photometry, sensing, noise)
     order = np.random.default_rng(0).permutation(len(truth))
     for part in (order, order[:7], order[7:8]):
         own = Photometry(*(array[part] for array in photometry))
-        alone = recover(measurements[part], own, sensing, noise)
+        alone = recover(light.of_pixels(part), own, sensing, noise)
         np.testing.assert_array_equal(alone.count, whole.count[part])
         np.testing.assert_array_equal(dense(alone), dense(whole)[part])
 
@@ -136,12 +137,12 @@ def test_dark_channels_get_empty_rows(recover, sensing_of, observe):
 @pytest.mark.parametrize("colours", [1, 3])
 def test_grey_camera_counts_once(recover, sensing_of, observe, colours):
     sensing = sensing_of(BANDS, 12, channels=colours)
-    measurements, photometry, noise = observe(sensing, mixture(6))
-    grey = np.repeat(measurements[..., :1], 3, axis=2)
-    found = recover(grey, photometry, sensing, noise, conditions=Conditions(grey=True))
+    light, photometry, noise = observe(sensing, mixture(6))
+    grey = np.repeat(light.values[..., :1], 3, axis=2)
+    found = recover(PatternLight.of(grey), photometry, sensing, noise, conditions=Conditions(grey=True))
     usable = np.zeros(grey.shape, bool)
     usable[..., 0] = True
-    alone = dense(dgsr.recover(grey, photometry, sensing, noise, usable))
+    alone = dense(dgsr.recover(PatternLight.of(grey, usable), photometry, sensing, noise))
     for c in range(3):
         np.testing.assert_array_equal(dense(found)[:, c], dense(found)[:, 0])
     assert np.abs(dense(found)[:, 0] - mixture(6)[:, 0]).sum(1).mean() < 0.3
@@ -153,9 +154,9 @@ def test_grey_camera_counts_once(recover, sensing_of, observe, colours):
 def test_error_of_the_model_is_left_unexplained(sensing_of, observe):
     truth = np.concatenate([lobe(x + 0.5, 12.4, 2.5, 1.2, 0.3) for x in range(6, 26)])
     sensing = sensing_of(BANDS, 13)
-    measurements, photometry, noise = observe(sensing, truth)
-    wrong = 0.06 * np.random.default_rng(0).standard_normal(measurements.shape[1])[:, np.newaxis]
-    seen = (measurements + wrong * photometry.rho[:, np.newaxis]).astype(np.float32)
+    light, photometry, noise = observe(sensing, truth)
+    wrong = 0.06 * np.random.default_rng(0).standard_normal(light.values.shape[1])[:, np.newaxis]
+    seen = PatternLight.of((light.values + wrong * photometry.rho[:, np.newaxis]).astype(np.float32))
     off = [
         np.abs(dense(dgsr.recover(seen, photometry, sensing, noise, conditions=c)) - truth).sum()
         for c in (Conditions(model_error=0.06), Conditions())
@@ -185,15 +186,15 @@ def test_one_level_serves(recover, sensing_of, observe):
     assert np.abs(found - truth).sum(2).max() < 0.1
 
 
-def test_measurements_of_another_number_of_pixels_or_patterns_are_refused(recover, sensing_of, observe):
+def test_light_of_another_number_of_pixels_or_patterns_are_refused(recover, sensing_of, observe):
     sensing = sensing_of(BANDS, 11)
-    measurements, photometry, noise = observe(sensing, mixture(3))
-    with pytest.raises(ValueError, match="measurements"):
-        recover(measurements[:2], photometry, sensing, noise)
+    light, photometry, noise = observe(sensing, mixture(3))
+    with pytest.raises(ValueError, match="light must be"):
+        recover(light.of_pixels(slice(2)), photometry, sensing, noise)
     with pytest.raises(ValueError, match="patterns"):
-        recover(measurements[:, 1:], photometry, sensing, noise)
+        recover(light.of_patterns(np.arange(1, light.values.shape[1])), photometry, sensing, noise)
 
 
 def args(scene, sensing):
-    measurements, photometry, noise = scene
-    return measurements, photometry, sensing, noise
+    light, photometry, noise = scene
+    return light, photometry, sensing, noise

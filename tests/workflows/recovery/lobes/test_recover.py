@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.camera.noise import NoiseModel
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry, fit_photometry
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.lobes.options import FINE, LobesOptions
@@ -64,8 +65,8 @@ def moments(T):
 
 
 def recovered(patterns, scene, options=FINE, **given):
-    measurements, photometry, noise = scene
-    return lobes.recover(measurements, photometry, patterns, noise, options=options, **given)
+    light, photometry, noise = scene
+    return lobes.recover(light, photometry, patterns, noise, options=options, **given)
 
 
 def part_of(photometry, part):
@@ -194,12 +195,12 @@ def test_disagreement_decides_whether_channels_share_t(patterns, varied, observe
 def test_patterns_improve_s_and_rho(patterns, truth, observe):
     n, rng, noise = 40, np.random.default_rng(0), NoiseModel(4e-6, 5e-5)
     T = np.repeat(truth((25.3, 18.6, 3.0, 1.5, 0.6)), n, axis=0)
-    measurements, exact, _ = observe(patterns, T)
+    light, exact, _ = observe(patterns, T)
     levels = np.repeat(np.linspace(0, 1, 4)[:, None], 3, axis=1).astype(np.float32)
     seen = exact.S[:, None] + exact.rho[:, None] * levels
     seen = (seen + np.sqrt(noise.variance(seen)) * rng.standard_normal(seen.shape)).astype(np.float32)
-    alone = fit_photometry(seen, levels, np.ones(seen.shape, bool), noise, np.ones(4, int))
-    joint = recovered(patterns, (measurements, alone, noise)).photometry
+    alone = fit_photometry(PatternLight.of(seen), levels, noise)
+    joint = recovered(patterns, (light, alone, noise)).photometry
     for name, least in (("S", 0.9), ("rho", 0.7)):
         before, after = (np.std(getattr(fit, name) - getattr(exact, name)) for fit in (alone, joint))
         assert after < least * before
@@ -207,8 +208,8 @@ def test_patterns_improve_s_and_rho(patterns, truth, observe):
 
 
 def test_the_error_to_expect_is_about_that_of_composites(patterns, varied, observe):
-    measurements, photometry, noise = observe(patterns, varied)
-    found = lobes.recover(measurements, photometry, patterns, noise)
+    light, photometry, noise = observe(patterns, varied)
+    found = lobes.recover(light, photometry, patterns, noise)
     T, rng, squares = dense(patterns, found.transport), np.random.default_rng(0), []
     for size in (4, 8, 2):
         blocks = rng.integers(0, 2, (ROWS // size, COLUMNS // size))
@@ -221,14 +222,14 @@ def test_the_error_to_expect_is_about_that_of_composites(patterns, varied, obser
 @pytest.mark.parametrize("colours", ["patterns", "coloured"])
 def test_any_batch_and_order_give_the_same_bytes(monkeypatch, request, colours, varied, observe):
     shown = request.getfixturevalue(colours)
-    measurements, photometry, noise = observe(shown, varied)
+    light, photometry, noise = observe(shown, varied)
     photometry.rho[4] = 0
-    whole = lobes.recover(measurements, photometry, shown, noise)
+    whole = lobes.recover(light, photometry, shown, noise)
     start = np.append(0, np.cumsum(whole.transport.count.sum(axis=1, dtype=int)))
     order = np.random.default_rng(0).permutation(len(varied))
     monkeypatch.setattr(lobes, "_BLOCK", 5)
     for part in (order, order[:7], order[7:8]):
-        alone = lobes.recover(measurements[part], part_of(photometry, part), shown, noise)
+        alone = lobes.recover(light.of_pixels(part), part_of(photometry, part), shown, noise)
         np.testing.assert_array_equal(alone.transport.count, whole.transport.count[part])
         np.testing.assert_array_equal(alone.transport.shared, whole.transport.shared[part])
         entries = np.concatenate([np.arange(start[p], start[p + 1]) for p in part])
@@ -289,29 +290,29 @@ def test_without_light_there_are_no_rows(patterns, coloured, truth, observe, n):
 
 def test_what_was_not_measured_is_left_out(patterns, truth, observe):
     T = truth((25.3, 18.6, 2.0, 1.5, 0.6), (40.0, 30.0, 3.0, 1.5, 0.6))
-    measurements, photometry, noise = observe(patterns, T)
-    usable = np.ones(measurements.shape, bool)
+    light, photometry, noise = observe(patterns, T)
+    usable = light.usable.copy()
     usable[:, 3::5] = False
-    clipped, missing = measurements.copy(), measurements.copy()
+    clipped, missing = light.values.copy(), light.values.copy()
     clipped[~usable], missing[~usable] = 1, np.nan
-    by_mask = lobes.recover(clipped, photometry, patterns, noise, usable)
-    by_nan = lobes.recover(missing, photometry, patterns, noise)
+    by_mask = lobes.recover(PatternLight.of(clipped, usable), photometry, patterns, noise)
+    by_nan = lobes.recover(PatternLight.of(missing), photometry, patterns, noise)
     assert np.abs(dense(patterns, by_mask.transport) - T).sum(axis=2).max() < 0.4
     for one, other in zip(vars(by_mask.transport).values(), vars(by_nan.transport).values(), strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(by_mask.photometry.rho, by_nan.photometry.rho)
-    believed = dense(patterns, lobes.recover(clipped, photometry, patterns, noise).transport)
+    believed = dense(patterns, lobes.recover(PatternLight.of(clipped), photometry, patterns, noise).transport)
     assert np.abs(believed - T).sum(axis=2).max() > 0.5
 
 
 @pytest.mark.parametrize("colours", ["patterns", "coloured"])
 def test_bad_input_gives_finite_rows(spoil, request, colours, varied, observe):
     shown = request.getfixturevalue(colours)
-    measurements, photometry, noise = observe(shown, varied)
-    measurements, photometry = spoil(measurements, photometry, -1e3)
+    light, photometry, noise = observe(shown, varied)
+    light, photometry = spoil(light, photometry, -1e3)
     for least_contrast in (3.0, 0.0):
         options = LobesOptions(least_contrast=least_contrast)
-        found = recovered(shown, (measurements, photometry, noise), options)
+        found = recovered(shown, (light, photometry, noise), options)
         assert np.isfinite(found.transport.weight).all()
         sane = [0, 2, 5]
         error = np.abs(dense(shown, found.transport) - varied).sum(axis=2)
@@ -361,40 +362,41 @@ def test_a_pyramid_of_one_grid_suffices(patterns_of, gaussian, observe):
 
 
 def test_grey_camera_counts_once(patterns, truth, observe):
-    measurements, photometry, noise = observe(patterns, truth((25.3, 18.6, 3.0, 1.0), (40.1, 30.2, 1.0, 1.0)))
-    grey = np.repeat(measurements[..., :1], 3, axis=2)
-    found = lobes.recover(grey, photometry, patterns, noise, conditions=lobes.Conditions(grey=True))
+    light, photometry, noise = observe(patterns, truth((25.3, 18.6, 3.0, 1.0), (40.1, 30.2, 1.0, 1.0)))
+    grey = np.repeat(light.values[..., :1], 3, axis=2)
+    found = lobes.recover(
+        PatternLight.of(grey), photometry, patterns, noise, conditions=lobes.Conditions(grey=True)
+    )
     assert found.transport.shared.all()
     for values in (found.photometry.S, found.photometry.rho):
         np.testing.assert_array_equal(values, np.repeat(values[:, :1], 3, axis=1))
     usable = np.zeros(grey.shape, bool)
     usable[..., 0] = True
-    alone = lobes.recover(grey, photometry, patterns, noise, usable)
+    alone = lobes.recover(PatternLight.of(grey, usable), photometry, patterns, noise)
     np.testing.assert_array_equal(found.transport.weight, alone.transport.weight)
 
 
 def test_error_of_the_model_is_left_unexplained(patterns, truth, observe):
     T = truth(*[(x, 18.6, 1.5, 1.0) for x in range(8, 56, 4)])
-    measurements, photometry, noise = observe(patterns, T)
+    light, photometry, noise = observe(patterns, T)
     wrong = 0.04 * np.random.default_rng(0).standard_normal(patterns.count)
-    seen = (measurements + wrong[:, np.newaxis] * photometry.rho[:, np.newaxis]).astype(np.float32)
+    seen = (light.values + wrong[:, np.newaxis] * photometry.rho[:, np.newaxis]).astype(np.float32)
 
     def off(conditions):
-        found = recovered(patterns, (seen, photometry, noise), conditions=conditions)
+        found = recovered(patterns, (PatternLight.of(seen), photometry, noise), conditions=conditions)
         return np.abs(dense(patterns, found.transport) - T).sum()
 
     assert off(lobes.Conditions(model_error=0.04)) < 0.8 * off(lobes.Conditions())
 
 
 def test_shapes_that_do_not_fit_are_refused(patterns, truth, observe):
-    measurements, photometry, noise = observe(patterns, truth((25.3, 18.6, 3.0, 1.0)))
-    for wrong in (measurements[:, 1:], measurements[..., :1], measurements[0]):
-        with pytest.raises(ValueError, match="measurements"):
-            lobes.recover(wrong, photometry, patterns, noise)
-    with pytest.raises(ValueError, match="measurements"):
-        lobes.recover(np.repeat(measurements, 2, axis=0), photometry, patterns, noise)
+    light, photometry, noise = observe(patterns, truth((25.3, 18.6, 3.0, 1.0)))
+    values = light.values
+    for wrong in (values[:, 1:], values[..., :1], values[0], np.repeat(values, 2, axis=0)):
+        with pytest.raises(ValueError, match="light must be"):
+            lobes.recover(PatternLight.of(wrong), photometry, patterns, noise)
     short = lobes.Conditions(strays=np.ones((2, patterns.count), np.float32))
     with pytest.raises(ValueError, match="strays"):
-        lobes.recover(measurements, photometry, patterns, noise, conditions=short)
+        lobes.recover(light, photometry, patterns, noise, conditions=short)
     with pytest.raises(ValueError, match="nodes"):
-        lobes.recover(measurements, photometry, replace(patterns, code=patterns.code[:5]), noise)
+        lobes.recover(light, photometry, replace(patterns, code=patterns.code[:5]), noise)

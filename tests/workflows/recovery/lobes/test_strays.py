@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from workflows.recovery.camera.pattern_light import PatternLight
 from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.lobes.recover import recover
 from workflows.recovery.lobes.strays import find_strong_strays, subtract_strays, write_strays
@@ -38,21 +39,21 @@ def test_what_is_left_is_normalised_again() -> None:
 def test_t_is_recovered_beside_stray_light(patterns_of, gaussian, observe, channels: int) -> None:
     shown = patterns_of(BANDS, 1, channels=channels)
     T = np.concatenate([gaussian(COLUMNS, ROWS, x, 20.6, 1.5, 1.0) for x in (14.6, 30.2, 45.3)])
-    measurements, photometry, noise = observe(shown, T)
+    plain, photometry, noise = observe(shown, T)
     rng = np.random.default_rng(0)
     lit = np.sign(rng.standard_normal((4, shown.count + 2))).astype(np.float32)
     lit -= lit[:, :-2].mean(axis=1, keepdims=True)
     strays = np.concatenate([np.ones((1, lit.shape[1]), np.float32), lit])
     amount = rng.uniform(-0.03, 0.03, (3, 1, 4)) * photometry.rho[..., np.newaxis]
     light = amount @ lit
-    seen = measurements + light[..., :-2].transpose(0, 2, 1).astype(np.float32)
+    seen = PatternLight.of(plain.values + light[..., :-2].transpose(0, 2, 1).astype(np.float32))
     from_constants = type(photometry)(
         (photometry.S + light[..., -2]).astype(np.float32),
         (photometry.rho + light[..., -1] - light[..., -2]).astype(np.float32),
         photometry.black_variance,
         photometry.white_variance,
     )
-    clean = recover(measurements, photometry, shown, noise)
+    clean = recover(plain, photometry, shown, noise)
     beside = recover(seen, from_constants, shown, noise, conditions=Conditions(strays=strays))
     ignored = recover(seen, from_constants, shown, noise)
     np.testing.assert_allclose(beside.photometry.S, clean.photometry.S, atol=2e-3)
@@ -92,7 +93,7 @@ def test_a_pixel_that_sees_the_border_keeps_its_mean_light() -> None:
         )
     )
     values = (light[:, :m, np.newaxis] * three).astype(np.float32)
-    stray, found = find_strong_strays(values, given, rows.astype(np.float32), None, None)
+    stray, found = find_strong_strays(PatternLight.of(values), given, rows.astype(np.float32))
     left = values - stray
     np.testing.assert_allclose(found.S[:, 0], S, atol=0.01)
     np.testing.assert_allclose(found.rho[:, 0], rho, atol=0.01)
@@ -113,9 +114,10 @@ def test_what_explains_a_pixel_by_chance_is_left_to_its_lobes(m: int) -> None:
     usable = np.ones(values.shape, bool)
     usable[: n // 2, m // 2 :] = False
     S, rho, variance = (np.full((n, 3), value, np.float32) for value in (0.1, 0.5, 1e-6))
-    stray, _ = find_strong_strays(values, Photometry(S, rho, variance, variance), rows, usable, None)
+    light = PatternLight.of(values, usable)
+    stray, _ = find_strong_strays(light, Photometry(S, rho, variance, variance), rows)
     assert stray[: n // 2].any(axis=(1, 2)).mean() < 0.02
     assert stray[n // 2 :].any(axis=(1, 2)).mean() < 0.02
     half = Photometry(*(part[: n // 2] for part in (S, rho, variance, variance)))
-    alone, _ = find_strong_strays(values[: n // 2], half, rows, usable[: n // 2], None)
+    alone, _ = find_strong_strays(light.of_pixels(slice(n // 2)), half, rows)
     np.testing.assert_array_equal(alone, stray[: n // 2])

@@ -19,10 +19,10 @@ def patterns(patterns_of, request):
 @pytest.fixture
 def errors(scene, error, patterns, places, monkeypatch):
     """Square error of each pixel before a random backdrop: of its own fits alone, and of averages."""
-    (measurements, photometry, noise), _ = scene
+    (light, photometry, noise), _ = scene
 
     def square():
-        return error(lobes.recover(measurements, photometry, patterns, noise, places=places).transport) ** 2
+        return error(lobes.recover(light, photometry, patterns, noise, places=places).transport) ** 2
 
     of_averages = square()
     monkeypatch.setattr(lobes, "adjacent", lambda places: np.full((len(places), 8), -1))
@@ -56,8 +56,8 @@ def test_an_edge_stays_an_edge(errors, places):
 
 
 def test_shares_of_an_average_sum_to_one(scene, patterns, places):
-    (measurements, photometry, noise), _ = scene
-    found = lobes.recover(measurements, photometry, patterns, noise, places=places)
+    (light, photometry, noise), _ = scene
+    found = lobes.recover(light, photometry, patterns, noise, places=places)
     ones = np.ones((patterns.pyramid.nodes, 3), np.float32)
     np.testing.assert_allclose(found.transport.apply(ones), 1, atol=2e-3)
 
@@ -71,13 +71,13 @@ def test_channels_of_dispersing_glass_tell_more_together(patterns_of, gaussian, 
         each = [gaussian(COLUMNS, ROWS, x + 2 * c, y + c, 3, 1.5, angle)[:, 0] for c in (-1, 0, 1)]
         pixels.append(np.stack(each, axis=1))
     T = np.concatenate(pixels)
-    measurements, photometry, noise = observe(patterns, T)
-    light = rng.random((ROWS, COLUMNS, 3), np.float32)
-    expected = np.einsum("nci,ic->nc", T, light.reshape(-1, 3))
+    light, photometry, noise = observe(patterns, T)
+    backdrop = rng.random((ROWS, COLUMNS, 3), np.float32)
+    expected = np.einsum("nci,ic->nc", T, backdrop.reshape(-1, 3))
 
     def error(places):
-        found = lobes.recover(measurements, photometry, patterns, noise, places=places).transport
-        return np.mean((found.apply(patterns.pyramid.light(light)) - expected) ** 2)
+        found = lobes.recover(light, photometry, patterns, noise, places=places).transport
+        return np.mean((found.apply(patterns.pyramid.light(backdrop)) - expected) ** 2)
 
     far_apart = 1000 * np.stack([np.arange(len(T)), np.zeros(len(T), int)], axis=1)
     assert error(far_apart) < 0.9 * error(None)

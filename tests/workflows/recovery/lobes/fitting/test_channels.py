@@ -34,15 +34,15 @@ def test_pixels_at_a_border_of_decisions_are_disputed():
 
 
 def test_disputed_pixels_gain_from_some_of_both(patterns, glass, observe, places, monkeypatch):
-    measurements, photometry, noise = observe(patterns, glass)
-    light = np.random.default_rng(1).random((ROWS, COLUMNS, 3), np.float32)
-    expected = np.einsum("nci,ic->nc", glass, light.reshape(-1, 3))
+    light, photometry, noise = observe(patterns, glass)
+    backdrop = np.random.default_rng(1).random((ROWS, COLUMNS, 3), np.float32)
+    expected = np.einsum("nci,ic->nc", glass, backdrop.reshape(-1, 3))
 
     def recovered():
-        found = lobes.recover(measurements, photometry, patterns, noise, places=places).transport
+        found = lobes.recover(light, photometry, patterns, noise, places=places).transport
         ones = np.ones((patterns.pyramid.nodes, 3), np.float32)
         np.testing.assert_allclose(found.apply(ones), 1, atol=2e-3)
-        return np.mean((found.apply(patterns.pyramid.light(light)) - expected) ** 2)
+        return np.mean((found.apply(patterns.pyramid.light(backdrop)) - expected) ** 2)
 
     of_both = recovered()
     monkeypatch.setattr(lobes, "disputed", lambda separate, near: np.zeros(len(separate), bool))

@@ -88,8 +88,8 @@ def test_places_are_found_with_few_patterns(patterns, dispersed, observe):
         (*rng.uniform((40, 30), (216, 162)), *rng.uniform(2, 4, 2), rng.uniform(0, 3)) for _ in range(40)
     ]
     truth = np.concatenate([dispersed(*shape) for shape in shapes])
-    measurements, photometry, noise = observe(patterns, truth)
-    found = recover(measurements, photometry, patterns, noise).transport
+    light, photometry, noise = observe(patterns, truth)
+    found = recover(light, photometry, patterns, noise).transport
     ramp = np.tile(np.arange(COLUMNS, dtype=np.float32)[:, np.newaxis], (ROWS, 1, 3))
     error = found.apply(patterns.pyramid.light(ramp)) - truth @ ramp[..., 0].reshape(-1)
     assert np.mean(np.abs(error).max(axis=1) < 1) > 0.9

@@ -37,9 +37,9 @@ def test_pixels_without_places_have_no_neighbours():
 
 
 def test_neighbours_lose_nothing_and_edges_stay(scene, error, patterns, places):
-    (measurements, photometry, noise), _ = scene
-    alone = lobes.recover(measurements, photometry, patterns, noise)
-    together = lobes.recover(measurements, photometry, patterns, noise, places=places)
+    (light, photometry, noise), _ = scene
+    alone = lobes.recover(light, photometry, patterns, noise)
+    together = lobes.recover(light, photometry, patterns, noise, places=places)
     apart, shared = (error(found.transport) for found in (alone, together))
     assert np.sqrt(np.mean(shared**2)) < 1.05 * np.sqrt(np.mean(apart**2))
     edge = np.isin(places[:, 1] - 40, (9, 10))
@@ -47,9 +47,9 @@ def test_neighbours_lose_nothing_and_edges_stay(scene, error, patterns, places):
 
 
 def test_one_step_suffices_beside_neighbours_that_took_theirs(scene, error, patterns, places):
-    (measurements, photometry, noise), _ = scene
+    (light, photometry, noise), _ = scene
     options = lobes.FINE._replace(steps=1, most_lobes=1, doubt=1.0)
-    alone = lobes.recover(measurements, photometry, patterns, noise, options=options)
-    together = lobes.recover(measurements, photometry, patterns, noise, options=options, places=places)
+    alone = lobes.recover(light, photometry, patterns, noise, options=options)
+    together = lobes.recover(light, photometry, patterns, noise, options=options, places=places)
     apart, shared = (error(found.transport) for found in (alone, together))
     assert np.mean(shared) < np.mean(apart)
