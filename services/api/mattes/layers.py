@@ -54,22 +54,12 @@ ALL = "all.exr"
 NODES = nodes.FILES | live_module.FILES
 OF_PLATE = ("stmap.exr", "blender.py", "nuke.nk", "nuke_stmap.nk")
 """The files that can take a plate of the frame."""
-Lobes = Annotated[
-    int,
-    Query(
-        ge=1,
-        le=layers.MOST_LOBES,
-        description="The most lobes of a pixel; further ones are merged into these.",
-    ),
-]
+OF_LOBES = "The most lobes of a pixel; further ones are merged into these."
+AS_FIT = "By default {}, and of a large frame as many as take 1 GiB before they are compressed."
+Lobes = Annotated[int, Query(ge=1, le=layers.MOST_LOBES, description=OF_LOBES)]
 FittingLobes = Annotated[
     int | None,
-    Query(
-        ge=1,
-        le=layers.MOST_LOBES,
-        description="The most lobes of a pixel; further ones are merged into these. "
-        f"By default {layers.LOBES}, and of a large frame as many as take 1 GiB before they are compressed.",
-    ),
+    Query(ge=1, le=layers.MOST_LOBES, description=f"{OF_LOBES} {AS_FIT.format(layers.LOBES)}"),
 ]
 FittingLookups = Annotated[
     int | None,
@@ -77,7 +67,7 @@ FittingLookups = Annotated[
         ge=1,
         le=LOOKUPS,
         description="The most lookups of a pixel in the files of a node; further cells are merged into these. "
-        f"By default {LOOKUPS}, and of a large frame as many as take 1 GiB before they are compressed.",
+        + AS_FIT.format(LOOKUPS),
     ),
 ]
 OverPlate = Annotated[
