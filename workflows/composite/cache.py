@@ -81,13 +81,11 @@ class Cache:
             strip = read_strip(matte, row, number, there)
         except BaseException as error:
             with self._lock:
-                if self._reading.get(key) is mine:  # else the matte was deleted meanwhile, the usual reason
-                    del self._reading[key]
+                self._end(key, mine)
             mine.set_exception(error)
             raise
         with self._lock:
-            # Unless the matte was deleted meanwhile.
-            if self._reading.pop(key, None) is mine:
+            if self._end(key, mine):
                 self._strips[key] = strip
                 self.bytes += strip.nbytes
                 while self.bytes > self._memory:
@@ -95,6 +93,13 @@ class Cache:
                     self.bytes -= old.nbytes
         mine.set_result(strip)
         return strip
+
+    def _end(self, key: Key, read: Future[Strip]) -> bool:
+        """End a read; False if the matte was forgotten meanwhile. Another thread may read it again then."""
+        is_wanted = self._reading.get(key) is read
+        if is_wanted:
+            del self._reading[key]
+        return is_wanted
 
     def places(self, id: str, threads: int) -> Places:
         """Where the pixels of a matte look, see `places_of`; kept for a few mattes."""

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -150,6 +150,29 @@ def test_nothing_is_kept_of_a_matte_that_is_forgotten(objects: Objects, matte: M
     for read in (lambda: cache.strip("m", 0, 0), lambda: cache.places("m", 1)):
         with pytest.raises(Corrupt, match="m is not in the store"):
             read()
+
+
+def test_a_read_that_outlives_its_matte_leaves_the_next_read_alone(
+    objects: Objects, matte: Matte, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache, begun, ended = Cache(objects, 1 << 30), threading.Event(), threading.Event()
+    later: list[Future[Strip]] = []
+
+    def read(*given: Any) -> Strip:
+        if later:
+            begun.set()
+            assert ended.wait(120)
+        else:
+            cache.forget("m")
+            later.append(thread.submit(cache.strip, "m", 0, 0))
+            assert begun.wait(120)
+        return read_strip(*given)
+
+    monkeypatch.setattr(cache_module, "read_strip", read)
+    with ThreadPoolExecutor(1) as thread:
+        cache.strip("m", 0, 0)
+        ended.set()
+        assert later[0].result(120).nbytes == cache.bytes
 
 
 def test_mattes_that_were_not_used_for_long_are_opened_again(
