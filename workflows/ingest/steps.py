@@ -20,11 +20,11 @@ from workflows.ingest.archive import CaptureArchive
 from workflows.ingest.camera.border_exposure import BorderValues
 from workflows.ingest.camera.calibration import calibrate
 from workflows.ingest.manifest import MANIFEST, Manifest, Video
+from workflows.ingest.pixel_sample import take_sample
 from workflows.ingest.report.survey import survey
 from workflows.ingest.trial.frame_order import check_frames
 from workflows.ingest.trial.qualities import try_qualities
 from workflows.ingest.trial.steadiness import find_steadiness
-from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.ingest.video.border_reader import LOOKS
 from workflows.ingest.video.frame_means import Share
 from workflows.ingest.video.matching import MAX_MATCHED, Expected, match_frames

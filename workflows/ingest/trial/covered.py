@@ -3,15 +3,9 @@
 import numpy as np
 
 from workflows.ingest.measured_light import exposures_of, odd_frames
+from workflows.ingest.pixel_sample import Doubles, PixelSample
 from workflows.ingest.trial.frame_order import MOST_ODD
-from workflows.ingest.trial.trial_recovery import (
-    Calibrated,
-    Doubles,
-    PixelSample,
-    RecoveredSample,
-    predict,
-    recover_seen,
-)
+from workflows.ingest.trial.trial_recovery import Calibrated, RecoveredSample, predict, recover_seen
 from workflows.programs.parts import Bernoulli
 from workflows.recovery.sensing import Patterns
 

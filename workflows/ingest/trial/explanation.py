@@ -9,9 +9,10 @@ from workflows.ingest.camera.border_exposure import BorderLight, BorderValues, i
 from workflows.ingest.camera.calibration import calibrate
 from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import look_up_of, monitor_curve_of
+from workflows.ingest.pixel_sample import PixelSample, take_sample
 from workflows.ingest.trial.covered import find_covered
 from workflows.ingest.trial.tone_mapping import find_tone_mapping
-from workflows.ingest.trial.trial_recovery import Calibrated, PixelSample, take_sample
+from workflows.ingest.trial.trial_recovery import Calibrated
 from workflows.ingest.trial.unexplained import MEASURED, Unexplained, find_unexplained
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out

@@ -11,13 +11,8 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.ingest.measured_light import monitor_curve_of
-from workflows.ingest.trial.trial_recovery import (
-    Calibrated,
-    PixelSample,
-    RecoveredSample,
-    recover_seen,
-    see_sample,
-)
+from workflows.ingest.pixel_sample import PixelSample, see_sample
+from workflows.ingest.trial.trial_recovery import Calibrated, RecoveredSample, recover_seen
 from workflows.programs.parts import Bernoulli
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import NoiseModel

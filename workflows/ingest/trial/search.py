@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from workflows.ingest.pixel_sample import FURTHEST, Doubles
 from workflows.ingest.trial.movement import smooth_path
-from workflows.ingest.trial.trial_recovery import FURTHEST, Doubles, Trial
+from workflows.ingest.trial.trial_recovery import Trial
 
 ROUNDS = 10
 """Rounds of measuring and correcting, at most."""

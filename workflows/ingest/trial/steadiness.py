@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderValues, is_free
 from workflows.ingest.measured_light import black_patterns
+from workflows.ingest.pixel_sample import Doubles, PixelSample
 from workflows.ingest.trial.explanation import explain
 from workflows.ingest.trial.search import Found, Search, are_within, size_of, usual_error
-from workflows.ingest.trial.trial_recovery import Doubles, PixelSample, measure_rest, try_recovery
+from workflows.ingest.trial.trial_recovery import measure_rest, try_recovery
 from workflows.ingest.trial.unexplained import find_unexplained
 from workflows.ingest.trial.white_exposure import find_white_excess
 from workflows.programs.program import Program

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderLight
 from workflows.ingest.local_gain import DARK, DISPLAY, Surroundings, surroundings
+from workflows.ingest.pixel_sample import Doubles, PixelSample
 from workflows.ingest.trial.border_tone_mapping import Power, border_power
-from workflows.ingest.trial.trial_recovery import HUBER, Doubles, PixelSample
+from workflows.ingest.trial.trial_recovery import HUBER
 from workflows.ingest.trial.unexplained import DETAIL, MIN_FLAT, SEEN, Rest
 from workflows.recovery.camera.noise import MEDIAN_TO_SIGMA
 

@@ -6,25 +6,16 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
 from storage.layout.captures import Stack
-from workflows.images.integer_formats import Codes
-from workflows.images.resample import LANCZOS_LOBES
 from workflows.images.tone_curves import Curve, to_light
-from workflows.ingest.camera.lit import find_lit
-from workflows.ingest.local_gain import local_gain
 from workflows.ingest.measured_light import (
-    clipped_from,
     conditions_of,
-    even_out,
     exposures_of,
     light_of,
-    look_up_of,
     observe,
-    odd_frames,
-    unclipped_light,
 )
+from workflows.ingest.pixel_sample import MIN_PIXELS, Doubles, Floats, PixelSample, Seen, see_sample
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import MEDIAN_TO_SIGMA, NoiseModel
 from workflows.recovery.camera.pattern_light import PatternLight
@@ -35,37 +26,14 @@ from workflows.recovery.sensing import Patterns
 from workflows.recovery.transport import Transport
 from workflows.threads import CORES, in_parts
 
-EDGE = 8
-"""Side in pixels of the squares that are examined."""
-SQUARES = 40
-"""Squares, at most, spread over what is recovered."""
-BYTES = 96 << 20
-"""Bytes of their frames, at most."""
-MIN_SQUARES = 8
-"""Squares that are needed: the spread of their results gives the standard error."""
-PIXELS = 640
-"""Pixels of the squares that are recovered, at most."""
 ALONE = 80
 """Pixels that a thread recovers at a time, where none starts from its neighbours."""
-VALUES = 1 << 20
-"""Pixels times frames that are recovered, at most."""
-MIN_PIXELS = 100
-"""Pixels with contrast that are needed."""
 CONTRAST = 10.0
 """Difference between black and white from which a pixel is used, in standard deviations of a mid-grey value."""
-FURTHEST = 3
-"""Pixels that a frame may be shifted by."""
 HUBER, REWEIGHTED = 1.5, 6
 """Standard deviations beyond which a value gets less weight, and how often weights are updated."""
 OUTLIER = 9.0
 """The most that one value adds to a residual."""
-
-_SLOPE = 2
-# Pixels that are read around those that are examined.
-_MARGIN = _SLOPE + LANCZOS_LOBES + FURTHEST
-
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
 
 
 class Calibrated(NamedTuple):
@@ -84,67 +52,6 @@ class Calibrated(NamedTuple):
     monitor: Curve
 
 
-class PixelSample(NamedTuple):
-    """Pixels of some squares in all frames.
-
-    Attributes
-    ----------
-    codes : (frames, squares, h, w, channels) uint8 or uint16
-        With `_MARGIN` on each side.
-    chosen : three (n,) intp
-        Square, row and column of each pixel, counted without the margins.
-    every : three (k,) intp
-        All pixels of the squares that are to be recovered and see the monitor, likewise.
-    wanted : int
-        Pixels of the whole frame that are to be recovered and see the monitor.
-    corners : (squares, 2) intp
-        Row and column in the frame of the first pixel of each square.
-    """
-
-    codes: Codes
-    chosen: tuple[NDArray[np.intp], ...]
-    every: tuple[NDArray[np.intp], ...]
-    wanted: int
-    corners: NDArray[np.intp]
-
-    @property
-    def places(self) -> NDArray[np.intp]:
-        """Row and column of each pixel in the frame, (2, n)."""
-        return self.corners[self.chosen[0]].T + self.chosen[1:]
-
-    def rings(self, widest: int) -> list[Floats]:
-        """The mean codes, as a share of full scale, of the square rings around each pixel, (frames, n) each: of its 8
-        neighbours, of the 16 pixels around these, and so on.
-        """
-        square, y, x = self.chosen
-        grey = self.codes.mean(axis=4, dtype=np.float32) / np.float32(np.iinfo(self.codes.dtype).max)
-        edges = range(1, 2 * widest + 2, 2)
-        sums = [
-            uniform_filter(grey, (0, 0, edge, edge))[:, square, y + _MARGIN, x + _MARGIN] * edge**2
-            for edge in edges
-        ]
-        return [(sums[n] - sums[n - 1]) / (8 * n) for n in range(1, len(sums))]
-
-    def thinned(self, most: int) -> "PixelSample":
-        """The same squares with at most so many of the chosen pixels, spread over all of them."""
-        step = -(-len(self.chosen[0]) // most)
-        return self._replace(chosen=tuple(axis[::step] for axis in self.chosen))
-
-    def some_squares(self) -> "PixelSample":
-        """All pixels of some of the squares, about as many as were chosen."""
-        step = -(-len(self.every[0]) // len(self.chosen[0]))
-        whole = self.every[0] % step == 0
-        return self._replace(chosen=tuple(axis[whole] for axis in self.every))
-
-
-class Seen(NamedTuple):
-    """The sample in frames that were shifted back; all arrays are (frames, n, channels)."""
-
-    values: Floats
-    whole: NDArray[np.bool_]
-    slopes: tuple[Floats, Floats]
-
-
 class Trial(NamedTuple):
     """How the frames differ from the prediction of a trial recovery.
 
@@ -161,57 +68,6 @@ class Trial(NamedTuple):
     off: Doubles
     error: Doubles
     residual: float
-
-
-def take_sample(stack: Stack, masked: bool = True) -> PixelSample | None:
-    """Choose squares spread over the pixels to recover that see the monitor, and pixels in them; None if there are too
-    few. Unless ``masked``, all that see the monitor are taken for those to recover.
-    """
-    wanted = find_lit(stack, Program.model_validate(stack.attributes["program"]))
-    if masked:
-        wanted &= stack.mask()
-    down, across = (np.arange(_MARGIN, size - _MARGIN - EDGE + 1, EDGE) for size in wanted.shape)
-    corners = [(y, x) for y in down.tolist() for x in across.tolist()]
-    counts = np.array([np.count_nonzero(wanted[y : y + EDGE, x : x + EDGE]) for y, x in corners], int)
-    useful = np.flatnonzero(counts >= EDGE**2 // 4)
-    size = stack.frames * (EDGE + 2 * _MARGIN) ** 2 * stack.channels * stack.dtype.itemsize
-    most = min(len(useful), SQUARES, BYTES // size)
-    if most < MIN_SQUARES:
-        return None
-    corners = [corners[useful[at]] for at in np.linspace(0, len(useful) - 1, most).astype(int)]
-    wide = EDGE + _MARGIN
-    squares = [stack.read(slice(y - _MARGIN, y + wide), slice(x - _MARGIN, x + wide)) for y, x in corners]
-    inside = np.stack([wanted[y : y + EDGE, x : x + EDGE] for y, x in corners])
-    every = np.nonzero(inside)
-    limit = max(min(PIXELS, VALUES // stack.frames), MIN_PIXELS)
-    count = int(np.count_nonzero(wanted))
-    whole = PixelSample(np.stack(squares, axis=1), every, every, count, np.array(corners, np.intp))
-    return whole.thinned(limit)
-
-
-def see_sample(stack: Stack, sample: PixelSample, shifts: Doubles) -> Seen:
-    """The sample in frames that are shifted back."""
-    look_up = look_up_of(stack)
-    square, y, x = sample.chosen
-    y, x = y + _SLOPE, x + _SLOPE
-    shape = (stack.frames, len(square), stack.channels)
-    values, across, down = np.empty((3, *shape), np.float32)
-    whole, odd = np.empty(shape, bool), set(odd_frames(stack.attributes))
-    for n, (codes, shift) in enumerate(zip(sample.codes, shifts.tolist(), strict=True)):
-        picture, unclipped = unclipped_light(codes, shift, _MARGIN - _SLOPE, look_up, clipped_from(stack))
-        picture = even_out(picture, n, stack.attributes)
-        values[n], whole[n] = picture[square, y, x], unclipped[square, y, x] & (n not in odd)
-        # The slope of the polynomial through five values.
-        for slope, (dy, dx) in ((across, (0, 1)), (down, (1, 0))):
-            near = picture[square, y + dy, x + dx] - picture[square, y - dy, x - dx]
-            far = picture[square, y + 2 * dy, x + 2 * dx] - picture[square, y - 2 * dy, x - 2 * dx]
-            slope[n] = (8 * near - far) / 12
-    gain = local_gain(stack)
-    if gain is not None:
-        local = gain.at(*sample.places)[..., np.newaxis]
-        for part in (values, across, down):
-            part /= local
-    return Seen(values, whole, (across, down))
 
 
 class RecoveredSample(NamedTuple):

@@ -5,15 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.ingest.trial.trial_recovery import (
-    Calibrated,
-    Doubles,
-    Floats,
-    PixelSample,
-    RecoveredSample,
-    predict,
-    recover_sample,
-)
+from workflows.ingest.pixel_sample import Doubles, Floats, PixelSample
+from workflows.ingest.trial.trial_recovery import Calibrated, RecoveredSample, predict, recover_sample
 from workflows.recovery.camera.noise import LEAST_READ, NoiseModel, fit_noise
 from workflows.recovery.glare import LEAST, Spread, centres, filter_patterns, fit_shares, spread_patterns
 from workflows.recovery.normalise import normalise

@@ -4,7 +4,8 @@ from functools import partial
 
 import numpy as np
 
-from workflows.ingest.trial.trial_recovery import Calibrated, PixelSample, try_recovery
+from workflows.ingest.pixel_sample import PixelSample
+from workflows.ingest.trial.trial_recovery import Calibrated, try_recovery
 from workflows.ingest.trial.unexplained import MEASURED, find_unexplained
 from workflows.recovery.sensing import Patterns
 

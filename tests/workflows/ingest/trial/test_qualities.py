@@ -10,10 +10,10 @@ from numba import njit
 
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
+from workflows.ingest.pixel_sample import take_sample
 from workflows.ingest.trial import qualities
 from workflows.ingest.trial.qualities import try_qualities
 from workflows.ingest.trial.steadiness import find_steadiness
-from workflows.ingest.trial.trial_recovery import take_sample
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out
 from workflows.simulation.glass_ball import glass_ball

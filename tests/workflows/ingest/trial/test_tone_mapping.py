@@ -14,11 +14,11 @@ from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
 from workflows.ingest.camera.border_exposure import BorderLight
 from workflows.ingest.local_gain import surroundings
+from workflows.ingest.pixel_sample import PixelSample
 from workflows.ingest.report.report import report
 from workflows.ingest.trial import tone_mapping
 from workflows.ingest.trial.border_tone_mapping import Power
 from workflows.ingest.trial.tone_mapping import LEAST, find_tone_mapping
-from workflows.ingest.trial.trial_recovery import PixelSample
 from workflows.ingest.trial.unexplained import Rest
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import NoiseModel

@@ -1,4 +1,4 @@
-"""A sample of a capture is recovered in parts, on several threads."""
+"""A sample of a capture: what it has of the pixels around its own, and its recovery in parts, on several threads."""
 
 import io
 from collections.abc import Callable
@@ -8,15 +8,9 @@ import pytest
 
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
+from workflows.ingest.pixel_sample import EDGE, MARGIN, PixelSample, take_sample
 from workflows.ingest.trial import trial_recovery
-from workflows.ingest.trial.trial_recovery import (
-    ALONE,
-    EDGE,
-    Calibrated,
-    PixelSample,
-    recover_sample,
-    take_sample,
-)
+from workflows.ingest.trial.trial_recovery import ALONE, Calibrated, recover_sample
 from workflows.programs.pyramid_light import lay_out
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
@@ -49,13 +43,13 @@ def test_a_sample_is_the_same_in_any_parts_and_on_any_threads(
 
 
 def test_rings_are_the_means_of_the_pixels_around_each() -> None:
-    size = EDGE + 2 * trial_recovery._MARGIN
+    size = EDGE + 2 * MARGIN
     codes = np.random.default_rng(3).integers(0, 256, (2, 3, size, size, 3), np.uint8)
     chosen = tuple(np.array(axis, np.intp) for axis in ([0, 2], [0, 7], [5, 7]))
     first, second = PixelSample(codes, chosen, chosen, 2, np.zeros((3, 2), np.intp)).rings(2)
     assert first.shape == second.shape == (2, 2)
     for n, (square, y, x) in enumerate(zip(*chosen, strict=True)):
-        down, across = y + trial_recovery._MARGIN, x + trial_recovery._MARGIN
+        down, across = y + MARGIN, x + MARGIN
         near, wide = (
             codes[1, square, down - k : down + k + 1, across - k : across + k + 1].mean(axis=2) / 255
             for k in (1, 2)

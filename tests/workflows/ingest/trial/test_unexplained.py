@@ -11,10 +11,11 @@ from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
 from workflows.ingest.measured_light import monitor_curve_of
+from workflows.ingest.pixel_sample import take_sample
 from workflows.ingest.report.expected_psnr import model_error_of
 from workflows.ingest.report.report import report
 from workflows.ingest.trial import unexplained
-from workflows.ingest.trial.trial_recovery import Calibrated, take_sample
+from workflows.ingest.trial.trial_recovery import Calibrated
 from workflows.programs.parts import Constant
 from workflows.programs.program import Program
 from workflows.programs.pyramid_light import lay_out

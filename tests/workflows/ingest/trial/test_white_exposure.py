@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
+from workflows.ingest.pixel_sample import take_sample
 from workflows.ingest.trial.steadiness import find_steadiness
-from workflows.ingest.trial.trial_recovery import Calibrated, take_sample
+from workflows.ingest.trial.trial_recovery import Calibrated
 from workflows.ingest.trial.white_exposure import find_white_excess
 from workflows.programs.pyramid_light import lay_out
 from workflows.simulation.glass_ball import glass_ball
