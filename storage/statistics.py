@@ -93,7 +93,7 @@ def stored_bytes(connection: Connection, *, all_owners: bool = False) -> int:
     return one + promised_bytes(connection, all_owners=all_owners)
 
 
-def received_bytes(connection: Connection, *, all_owners: bool = False) -> int:
+def received_bytes(connection: Connection, *, all_owners: bool) -> int:
     """The same without what is promised, see `promised_bytes`."""
     sums = [
         select(func.sum(func.coalesce(captures.c.stored, captures.c.bytes) + captures.c.row_bytes + ROW)),

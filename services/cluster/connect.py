@@ -79,7 +79,7 @@ def _loop() -> IOLoop:
 
 
 @contextmanager
-def dispatcher_of(settings: CoordinatorSettings, installation: str | None = None) -> Iterator[Dispatcher]:
+def dispatcher_of(settings: CoordinatorSettings, installation: str | None) -> Iterator[Dispatcher]:
     """A dispatcher for the cluster that the settings name, reachable yet or not, or for an embedded one.
 
     Parameters

@@ -336,7 +336,7 @@ def _failed(flight: Flight, **why: Any) -> list[Outcome]:
     return [Outcome(flight.job, tile, **(why if at == 0 else {})) for at, tile in enumerate(flight.left)]
 
 
-def _blamed(dead: Iterable[tuple[Flight, str]], starved: Container[str] = ()) -> list[Outcome]:
+def _blamed(dead: Iterable[tuple[Flight, str]], starved: Container[str]) -> list[Outcome]:
     """Outcomes of the tiles of dead workers: each blames the tile that it worked on.
 
     While workers come and go, one may have two tasks for a moment. Then the one submitted first ran.

@@ -103,7 +103,7 @@ def stretched_mean(
     monitor: tuple[int, int],
     columns: int,
     rows: int,
-    offset: tuple[int, int] = (0, 0),
+    offset: tuple[int, int],
 ) -> NDArray[np.float32]:
     """The mean over each cell of a grid of values that are stretched over a monitor, and rolled.
 

@@ -85,7 +85,7 @@ def recover_tile(
     matte: str,
     options: RecoveryOptions,
     index: int,
-    cut_out: CutOut | None = None,
+    cut_out: CutOut | None,
 ) -> int:
     """Recover the blocks of a matte that a tile consists of, one after another.
 
@@ -95,7 +95,7 @@ def recover_tile(
     ----------
     index : int
         Of the tile.
-    cut_out : CutOut, optional
+    cut_out : CutOut or None
         Where the object stands, if only it is to be recovered.
 
     Returns

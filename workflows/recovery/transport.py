@@ -107,7 +107,7 @@ class Transport:
         cell: NDArray[np.integer],
         weight: NDArray[np.floating],
         shared: NDArray[np.bool_],
-        least_weight: float = LEAST_WEIGHT,
+        least_weight: float,
     ) -> Self:
         """As `from_rows`, of entries whose cells need not ascend within a row and may repeat: weights are added."""
         row = np.repeat(np.arange(count.size), count.ravel())

@@ -175,7 +175,7 @@ def costs_of(
     patterns: Sequence[int],
     survey: dict[str, Any],
     model_error: float,
-    exposures: Sequence[float] | None = None,
+    exposures: Sequence[float] | None,
 ) -> dict[str, float]:
     """The mean square errors of composites by their causes, as far as these are known; see :func:`expected`.
 

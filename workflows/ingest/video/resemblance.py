@@ -23,7 +23,7 @@ _ODD = 5.0  # times the median squared distance from the part's mean: an odd pat
 _APART = 0.1  # difference of light from which one constant pattern must look brighter than the other
 
 
-def coarse_light(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]] = ()) -> Light:
+def coarse_light(program: Program, curve: Curve, images: Sequence[NDArray[np.float32]]) -> Light:
     """The light of every pattern of a program on the finest of `GRIDS`."""
     columns, rows = GRIDS[-1]
     laid = np.empty((program.count, rows, columns, 3), np.float32)
