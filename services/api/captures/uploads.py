@@ -1,6 +1,7 @@
 """Resumable uploads over HTTP: tus 1.0 (https://tus.io/protocols/resumable-upload)."""
 
 import time
+from collections.abc import AsyncIterator
 from datetime import UTC, datetime
 from email.utils import format_datetime
 from typing import Any
@@ -34,6 +35,7 @@ from storage.database.rows import new_id
 from storage.errors import Conflict, InvalidInput, NoRoom, NotFound, TooMany
 from storage.layout import uploads as stored_uploads
 from storage.layout.uploads import Part
+from storage.objects.byte_objects import Writer
 from storage.records import bodies, captures, uploads
 from storage.records.uploads import MAX_PARTS
 
@@ -143,22 +145,10 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
     offset, more, stopped = row.offset, True, None
     try:
         while more:
-            name, size, more = new_id(), 0, False
+            name = new_id()
             async with context.objects.write(stored_uploads.part_path(row.id, name)) as file:
                 stored.append(Part(name, 0))
-                try:
-                    async for data in body:
-                        size += len(data)
-                        if checksum:
-                            checksum.update(data)
-                        await file.write(data)
-                        if size >= PART:
-                            more = True
-                            break
-                except (ClientDisconnect, Conflict) as error:
-                    if checksum:
-                        raise
-                    stopped = error if isinstance(error, Conflict) else None
+                size, more, stopped = await _write_part(file, body, checksum)
             stored[-1] = Part(name, size)
             if not size:
                 empty = stored_uploads.part_path(row.id, stored.pop().name)
@@ -179,6 +169,29 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
     finally:
         await anyio.to_thread.run_sync(reservation.release)
     return await context.call(_get, context, row.id)
+
+
+async def _write_part(
+    file: Writer, body: AsyncIterator[bytes], checksum: Checksum | None
+) -> tuple[int, bool, Conflict | None]:
+    """Write the next `PART` bytes of a body; returns how many came, whether there may be more, and what stopped it.
+
+    Without a checksum, what came is kept when the client goes, or when another request wants the upload.
+    """
+    size = 0
+    try:
+        async for data in body:
+            size += len(data)
+            if checksum:
+                checksum.update(data)
+            await file.write(data)
+            if size >= PART:
+                return size, True, None
+    except (ClientDisconnect, Conflict) as error:
+        if checksum:
+            raise
+        return size, False, error if isinstance(error, Conflict) else None
+    return size, False, None
 
 
 async def _claim(context: Context, row: Row[Any], writer: str, size: int) -> None:
