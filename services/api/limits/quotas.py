@@ -1,7 +1,6 @@
 """Limits of owners and of the whole service, checked before anything is accepted."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from sqlalchemy import Connection
 
@@ -12,27 +11,6 @@ from storage.disks import require_reserve
 from storage.errors import NEARLY_FULL, NoRoom, TooMany
 from storage.objects import marker
 from storage.objects.store import Objects
-
-Unit = Literal["bytes", "frames", "pixels", "captures", "jobs", "seconds"]
-
-
-@dataclass(frozen=True)
-class Limit:
-    """A limit, from the setting of the same name.
-
-    Attributes
-    ----------
-    limit : int, optional
-        None if there is none.
-    used : int, optional
-        How much is in use, if the limit is for all items together.
-    """
-
-    name: str
-    unit: Unit
-    limit: int | None
-    used: int | None
-    description: str
 
 
 @dataclass(frozen=True)
@@ -55,46 +33,7 @@ class NewData:
 
 
 NOTHING = NewData()
-UNITS: dict[str, Unit] = {
-    "upload_bytes": "bytes",
-    "unpacked_bytes": "bytes",
-    "capture_frames": "frames",
-    "capture_pixels": "pixels",
-    "backdrop_bytes": "bytes",
-    "owner_captures": "captures",
-    "owner_jobs": "jobs",
-    "owner_bytes": "bytes",
-    "store_bytes": "bytes",
-    "upload_seconds": "seconds",
-    "capture_seconds": "seconds",
-    "matte_seconds": "seconds",
-    "job_seconds": "seconds",
-}
-"""The settings that are limits, with their units."""
 DELETE = "delete captures, mattes, videos, uploads, programs or ended jobs first"
-
-
-def limits_of(connection: Connection, settings: Settings, *, all_owners: bool) -> list[Limit]:
-    """All limits, with how much of each the owner of a connection uses.
-
-    Parameters
-    ----------
-    all_owners : bool
-        Whether to include how much all owners use together.
-    """
-    used = {
-        "owner_captures": statistics.captures_and_uploads(connection),
-        "owner_jobs": statistics.active_jobs(connection),
-        "owner_bytes": statistics.stored_bytes(connection),
-    }
-    if all_owners:
-        used["store_bytes"] = statistics.stored_bytes(connection, all_owners=True)
-    return [
-        Limit(
-            name, unit, getattr(settings, name), used.get(name), str(Settings.model_fields[name].description)
-        )
-        for name, unit in UNITS.items()
-    ]
 
 
 def admit(connection: Connection, settings: Settings, wanted: NewData = NOTHING) -> None:

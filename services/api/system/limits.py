@@ -1,13 +1,33 @@
 """Limits of the service and of its owners, over HTTP."""
 
+from typing import Literal
+
 from pydantic import BaseModel, Field
 
 from services.api.context import OwnerContext
 from services.api.http.router import Router
-from services.api.limits.quotas import Unit, limits_of
+from services.settings import Settings
+from storage import statistics
 from storage.database.engine import reading
 
 router = Router(tags=["system"])
+Unit = Literal["bytes", "frames", "pixels", "captures", "jobs", "seconds"]
+UNITS: dict[str, Unit] = {
+    "upload_bytes": "bytes",
+    "unpacked_bytes": "bytes",
+    "capture_frames": "frames",
+    "capture_pixels": "pixels",
+    "backdrop_bytes": "bytes",
+    "owner_captures": "captures",
+    "owner_jobs": "jobs",
+    "owner_bytes": "bytes",
+    "store_bytes": "bytes",
+    "upload_seconds": "seconds",
+    "capture_seconds": "seconds",
+    "matte_seconds": "seconds",
+    "job_seconds": "seconds",
+}
+"""The settings that are limits, with their units."""
 
 
 class Limit(BaseModel):
@@ -35,6 +55,21 @@ def get_limits(context: OwnerContext) -> Limits:
     """All limits, and how much of each the caller's owner uses. Admins also see how much the whole service uses."""
     caller = context.caller
     with reading(context.engine) as c:
-        found = limits_of(c, context.settings, all_owners=caller.may("admin"))
-    limits = [Limit.model_validate(limit, from_attributes=True) for limit in found]
+        used = {
+            "owner_captures": statistics.captures_and_uploads(c),
+            "owner_jobs": statistics.active_jobs(c),
+            "owner_bytes": statistics.stored_bytes(c),
+        }
+        if caller.may("admin"):
+            used["store_bytes"] = statistics.stored_bytes(c, all_owners=True)
+    limits = [
+        Limit(
+            name=name,
+            unit=unit,
+            limit=getattr(context.settings, name),
+            used=used.get(name),
+            description=str(Settings.model_fields[name].description),
+        )
+        for name, unit in UNITS.items()
+    ]
     return Limits(owner=caller.owner, scope=caller.scope, limits=limits)

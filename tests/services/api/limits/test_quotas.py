@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import Engine, update
 
 from services.api.app import build_app
-from services.api.limits.quotas import UNITS
+from services.api.system.limits import UNITS
 from services.settings import Settings
 from storage.database.engine import open_engine, reading, writing
 from storage.database.owners import for_owner
