@@ -142,8 +142,8 @@ def recover_seen(
 
     def recover_part(first: int) -> None:
         at = slice(first, first + firsts.step)
-        of_part = Photometry(*(values[at] for values in photometry))
-        parts[first] = recover(light.of_pixels(at), of_part, patterns, noise, options, conditions, places)
+        part = light.of_pixels(at), photometry.of_pixels(at)
+        parts[first] = recover(*part, patterns, noise, options, conditions, places)
 
     in_parts(recover_part, firsts, CORES)
     made = _joined([parts[first] for first in firsts])

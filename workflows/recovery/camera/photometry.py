@@ -47,6 +47,10 @@ class Photometry(NamedTuple):
     black_variance: NDArray[np.float32]
     white_variance: NDArray[np.float32]
 
+    def of_pixels(self, pixels: slice | NDArray[np.integer]) -> "Photometry":
+        """That of some pixels."""
+        return Photometry(*(array[pixels] for array in self))
+
 
 def fit_photometry(light: PatternLight, levels: NDArray[np.float32], noise: NoiseModel) -> Photometry:
     """Fit S and rho to frames of constant monitors.

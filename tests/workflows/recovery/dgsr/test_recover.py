@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from workflows.recovery.camera.pattern_light import PatternLight
-from workflows.recovery.camera.photometry import Photometry
 from workflows.recovery.dgsr import recover as dgsr
 from workflows.recovery.dgsr.options import DgsrOptions
 from workflows.recovery.normalise import Conditions
@@ -118,8 +117,7 @@ def test_result_does_not_depend_on_the_batch(recover, sensing_of, observe, colou
     whole = recover(light, photometry, sensing, noise)
     order = np.random.default_rng(0).permutation(len(truth))
     for part in (order, order[:7], order[7:8]):
-        own = Photometry(*(array[part] for array in photometry))
-        alone = recover(light.of_pixels(part), own, sensing, noise)
+        alone = recover(light.of_pixels(part), photometry.of_pixels(part), sensing, noise)
         np.testing.assert_array_equal(alone.count, whole.count[part])
         np.testing.assert_array_equal(dense(alone), dense(whole)[part])
 

@@ -7,7 +7,7 @@ import pytest
 
 from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.pattern_light import PatternLight
-from workflows.recovery.camera.photometry import Photometry, fit_photometry
+from workflows.recovery.camera.photometry import fit_photometry
 from workflows.recovery.lobes import recover as lobes
 from workflows.recovery.lobes.options import FINE, LobesOptions
 from workflows.recovery.sensing import Patterns
@@ -67,10 +67,6 @@ def moments(T):
 def recovered(patterns, scene, options=FINE, **given):
     light, photometry, noise = scene
     return lobes.recover(light, photometry, patterns, noise, options=options, **given)
-
-
-def part_of(photometry, part):
-    return Photometry(*(array[part] for array in photometry))
 
 
 @pytest.mark.parametrize("colours", ["patterns", "coloured"])
@@ -229,7 +225,7 @@ def test_any_batch_and_order_give_the_same_bytes(monkeypatch, request, colours, 
     order = np.random.default_rng(0).permutation(len(varied))
     monkeypatch.setattr(lobes, "_BLOCK", 5)
     for part in (order, order[:7], order[7:8]):
-        alone = lobes.recover(light.of_pixels(part), part_of(photometry, part), shown, noise)
+        alone = lobes.recover(light.of_pixels(part), photometry.of_pixels(part), shown, noise)
         np.testing.assert_array_equal(alone.transport.count, whole.transport.count[part])
         np.testing.assert_array_equal(alone.transport.shared, whole.transport.shared[part])
         entries = np.concatenate([np.arange(start[p], start[p + 1]) for p in part])
