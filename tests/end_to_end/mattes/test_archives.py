@@ -4,6 +4,7 @@ import io
 import json
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 from services.client import ServiceError
 from storage.layout import mattes
 from storage.layout.matte_archive import MANIFEST, Archive
-from storage.layout.mattes import Block
+from storage.layout.mattes import empty_block
 from storage.objects.store import Objects
 from tests.end_to_end.command_line import envmatte
 from tests.end_to_end.conftest import Service, digests, png, serving
@@ -138,12 +139,12 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     attributes = {"monitor": [8, 6], "crosstalk": np.eye(3).tolist(), "options": {}}
     matte = mattes.create(objects, "m", height=768, width=1024, columns=4, rows=3, **attributes)
     rng = np.random.default_rng(0)
-    nowhere = np.zeros((64, 64), bool)
-    count, cell = np.zeros((64, 64, 3), np.uint32), np.zeros(0, np.uint32)
+    black = empty_block(64, 64)
     for row, column in product(range(matte.block_rows), range(matte.block_columns)):
         S, rho = rng.random((2, 64, 64, 3), np.float32)
-        error, weight = rng.random((64, 64), np.float32), np.zeros(0, np.float32)
-        matte.write(row, column, Block(S, rho, error, ~nowhere, nowhere, count, cell, weight))
+        error = rng.random((64, 64), np.float32)
+        block = replace(black, S=S, rho=rho, error=error, recovered=~black.recovered)
+        matte.write(row, column, block)
     (folder / "matte.zip").write_bytes(b"".join(Archive(objects, "m")))
     return folder / "matte.zip"
 

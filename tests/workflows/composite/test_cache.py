@@ -3,6 +3,7 @@
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from storage.errors import Corrupt
 from storage.layout import mattes
-from storage.layout.mattes import Block, Matte
+from storage.layout.mattes import Block, Matte, empty_block
 from storage.objects.store import Objects
 from workflows.composite import cache as cache_module
 from workflows.composite.cache import Cache
@@ -28,12 +29,10 @@ def matte(objects: Objects) -> Matte:
     assert made.block == EDGE
     for row in range(4):
         for column in range(made.block_columns):
-            zero = np.zeros((EDGE, EDGE, 3), np.float32)
-            flags = np.ones((EDGE, EDGE), bool)
-            count = np.zeros((EDGE, EDGE, 3), np.uint32)
-            empty = np.zeros(0, np.uint32), np.zeros(0, np.float32)
-            S = zero + 100 * row + column
-            made.write(row, column, Block(S, zero, zero[..., 0], flags, ~flags, count, *empty))
+            black = empty_block(EDGE, EDGE)
+            made.write(
+                row, column, replace(black, S=black.S + 100 * row + column, recovered=~black.recovered)
+            )
     return made
 
 
@@ -113,11 +112,7 @@ def test_missing_block_is_an_error_for_all_readers_and_read_again_later(objects:
     with ThreadPoolExecutor(4) as threads:
         for one in [threads.submit(cache.strip, "n", 0, 0) for _ in range(4)]:
             assert isinstance(one.exception(), Corrupt)
-    zero = np.zeros((16, 16, 3), np.float32)
-    flags = np.zeros((16, 16), bool)
-    count = np.zeros((16, 16, 3), np.uint32)
-    empty = np.zeros(0, np.uint32), np.zeros(0, np.float32)
-    made.write(0, 0, Block(zero, zero, zero[..., 0], flags, flags, count, *empty))
+    made.write(0, 0, empty_block(16, 16))
     assert number(cache.strip("n", 0, 0)) == 0
 
 

@@ -1,12 +1,13 @@
 """Archives of synthetic mattes."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from storage.layout import mattes
 from storage.layout.matte_archive import Archive
-from storage.layout.mattes import Block
+from storage.layout.mattes import empty_block
 from storage.objects.store import Objects
 
 
@@ -27,11 +28,7 @@ def archive(folder: Path, width: int, height: int) -> bytes:
     rng = np.random.default_rng(0)
     for row in range(matte.block_rows):
         for column in range(matte.block_columns):
-            shape = tuple(span.stop - span.start for span in matte.span(row, column))
-            S = rng.random((*shape, 3), np.float32)
-            flags, zero = np.ones(shape, bool), np.zeros(shape, np.float32)
-            empty = np.zeros(0, np.uint32), np.zeros(0, np.float32)
-            matte.write(
-                row, column, Block(S, 0 * S, zero, flags, ~flags, np.zeros(S.shape, np.uint32), *empty)
-            )
+            black = empty_block(*(span.stop - span.start for span in matte.span(row, column)))
+            S = rng.random(black.S.shape, np.float32)
+            matte.write(row, column, replace(black, S=S, recovered=~black.recovered))
     return b"".join(Archive(objects, "plain"))

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from storage.layout import mattes
-from storage.layout.mattes import Block, Matte
+from storage.layout.mattes import Matte, empty_block
 from storage.objects.store import Objects
 from tests.workflows.composite.live.nodes.drawing import CROSSTALK, few_nodes
 from workflows.composite import composite
@@ -107,12 +108,9 @@ def test_large_matte_is_sampled(objects: Objects, monkeypatch: pytest.MonkeyPatc
 
     for row, column in product(range(large.block_rows), range(large.block_columns)):
         y, x = large.span(row, column)
-        shape = y.stop - y.start, x.stop - x.start
         S = np.repeat(np.add.outer(np.arange(y.start, y.stop), np.arange(x.start, x.stop))[..., None], 3, 2)
-        rows = np.zeros((*shape, 3), np.uint32), np.zeros(0, np.uint32), np.zeros(0, np.float32)
-        whole = np.ones(shape, bool)
-        S = S.astype(np.float32)
-        large.write(row, column, Block(S, 0 * S, whole.astype(np.float32), whole, whole, *rows))
+        black = empty_block(*S.shape[:2])
+        large.write(row, column, replace(black, S=S.astype(np.float32), recovered=~black.recovered))
     got, header = drawn(encode_live(large, 1), np.zeros((ROWS, COLUMNS, 3), np.float32))
     assert (header["width"], header["height"], header["step"]) == (45, 30, 2)
     assert got[..., 3].all()
