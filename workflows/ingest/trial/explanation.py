@@ -1,6 +1,6 @@
 """A trial recovery of a sample of the pixels from frames that show their patterns, without local tone mapping."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -72,26 +72,30 @@ def _explain(
 
     Local tone mapping that only the sample tells is left out again if T leaves more with it than without.
     """
-    at_rest, turn, before = np.zeros((stack.frames, 3)), 0, np.inf
-    while True:
+    at_rest, before = np.zeros((stack.frames, 3)), np.inf
+
+    def recover() -> tuple[Calibrated, Patterns, dict[str, Any], Unexplained | None]:
         capture = Calibrated(stack, program, monitor_curve_of(stack.attributes))
         light = lay_out(program, capture.monitor, stack.images(), scaled=stack.attributes["scaled"])
         measured = {name: stack.attributes[name] for name in MEASURED}
-        found = find_unexplained(capture, light, wide, at_rest)
-        if found is None or turn == TONE_MAPPING_TURNS:
+        return capture, light, measured, find_unexplained(capture, light, wide, at_rest)
+
+    capture, light, measured, found = recover()
+    for _ in range(TONE_MAPPING_TURNS):
+        if found is None:
             break
         of_border, left = _border_light(stack, border), found.rest.size()
         if of_border is None and left > before:
             # What the patterns don't explain, as of glass with many edges, has only looked like it.
             calibrate(stack, border)
-            turn = TONE_MAPPING_TURNS
-            continue
+            capture, light, measured, found = recover()
+            break
         before = left
         mapped = find_tone_mapping(stack, found.rest, wide, stack.attributes["tone_mapping"], of_border)
         if mapped is None:
             break
         calibrate(stack, border, tone_mapping=mapped)
-        turn += 1
+        capture, light, measured, found = recover()
     if wide is not sample:
         stack.annotate(**measured)
         found = find_unexplained(capture, light, sample, at_rest)
