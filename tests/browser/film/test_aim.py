@@ -1,7 +1,8 @@
 """Help before a film: the camera's picture is judged, and the program starts once all is well."""
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,28 +77,28 @@ def plain(*lines: int) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize(
-    ("frame", "wrong"),
+    ("draw", "wrong"),
     [
-        pytest.param(seen(), WELL, id="well"),
-        pytest.param(seen(angle=0.12, share=0.5), WELL, id="tilted"),
-        pytest.param(seen(share=0.35), WELL, id="far"),
-        pytest.param(seen(screen=(1280, 1024)), WELL, id="5 to 4"),
-        pytest.param(seen(size=(450, 800), share=0.8), WELL, id="upright"),
-        pytest.param(seen(light=(70, 200)), WELL, id="lit room"),
-        pytest.param(seen(share=0.9, at=(0.7, 0.5)), WELL | {"screen": "cut"}, id="cut off"),
-        pytest.param(seen(light=(12, 300)), WELL | {"exposure": "bright"}, id="clipped"),
-        pytest.param(seen(light=(6, 60)), WELL | {"exposure": "dark"}, id="dark"),
-        pytest.param(seen(blur=6), WELL | {"sharpness": "blurred"}, id="blurred"),
-        pytest.param(plain(), UNSEEN, id="a page"),
-        pytest.param(plain(*range(100, 360, 12)), UNSEEN, id="a page of text"),
-        pytest.param(np.full((450, 800), 90, np.uint8), UNSEEN, id="grey"),
+        pytest.param(seen, WELL, id="well"),
+        pytest.param(partial(seen, angle=0.12, share=0.5), WELL, id="tilted"),
+        pytest.param(partial(seen, share=0.35), WELL, id="far"),
+        pytest.param(partial(seen, screen=(1280, 1024)), WELL, id="5 to 4"),
+        pytest.param(partial(seen, size=(450, 800), share=0.8), WELL, id="upright"),
+        pytest.param(partial(seen, light=(70, 200)), WELL, id="lit room"),
+        pytest.param(partial(seen, share=0.9, at=(0.7, 0.5)), WELL | {"screen": "cut"}, id="cut off"),
+        pytest.param(partial(seen, light=(12, 300)), WELL | {"exposure": "bright"}, id="clipped"),
+        pytest.param(partial(seen, light=(6, 60)), WELL | {"exposure": "dark"}, id="dark"),
+        pytest.param(partial(seen, blur=6), WELL | {"sharpness": "blurred"}, id="blurred"),
+        pytest.param(plain, UNSEEN, id="a page"),
+        pytest.param(partial(plain, *range(100, 360, 12)), UNSEEN, id="a page of text"),
+        pytest.param(partial(np.full, (450, 800), 90, np.uint8), UNSEEN, id="grey"),
     ],
 )
 def test_picture_of_the_camera_is_judged(
-    desk: Page, service: Service, frame: NDArray[np.uint8], wrong: dict[str, str | None]
+    desk: Page, service: Service, draw: Callable[[], NDArray[np.uint8]], wrong: dict[str, str | None]
 ) -> None:
     desk.goto(f"{service.url}/#/film")
-    assert desk.evaluate(JUDGE, [None, sent(frame)]) == wrong
+    assert desk.evaluate(JUDGE, [None, sent(draw())]) == wrong
 
 
 def test_movement_is_seen_and_noise_is_none(desk: Page, service: Service) -> None:
