@@ -56,9 +56,9 @@ class Window(NamedTuple):
         height = matte.height - y if height is None else height
         for name, at, size, most in (("x", x, width, matte.width), ("y", y, height, matte.height)):
             if at < 0 or size < 1 or at + size > most:
+                crop = f"a crop from {name} = {at}" + (f", {size} pixels long," if 0 <= at < most else "")
                 raise OptionError(
-                    f"a crop from {name} = {at}, {size} pixels long, does not lie inside the matte of "
-                    f"{matte.width} x {matte.height} pixels",
+                    f"{crop} does not lie inside the matte of {matte.width} x {matte.height} pixels",
                     field=name,
                     limit=most,
                 )

@@ -19,6 +19,8 @@ FORMATS = (*integer_formats.FORMATS, *web_formats.FORMATS)
 """What Pillow opens of a backdrop: what browsers show, too."""
 SRGB_GAMMA = 1 / 2.2
 """What a PNG says whose values are sRGB, for those who know only its gAMA."""
+MOST_LIGHT = np.float32(np.finfo(np.float16).max)
+"""The largest light, of either sign: what pictures of 16-bit floats hold. Sums of much larger values would overflow."""
 SAME_GAMMA = 0.05
 """Gammas that differ by this share or less are the same, as libpng has it."""
 
@@ -41,16 +43,21 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
     Returns
     -------
     (height, width, 1 to 4) uint8 or uint16, or (height, width, 1 or 3) float32
-        Upright, grey or RGB. Integers keep an alpha channel; float values are linear light, black where transparent.
+        Upright, grey or RGB. Integers keep an alpha channel; float values are linear light within `MOST_LIGHT`, black
+        where transparent.
 
     Raises
     ------
     ImageError
+        If it can't be decoded, or a pixel is NaN.
     """
     if raw_files.is_raw(data):
         return camera_raw.develop(data, memory=memory)
     if float_formats.is_float(data):
-        return float_formats.in_rec_709(data, float_formats.decode(data, memory=memory, alpha=True))
+        light = float_formats.decode(data, memory=memory, alpha=True)
+        _check_numbers(light)
+        # Before the primaries are converted too: there infinity becomes NaN.
+        return _clip(float_formats.in_rec_709(data, _clip(light)))
     pixels = integer_formats.decode(data, memory=memory, alpha=True, formats=FORMATS)
     return _to_srgb(data, pixels) if transfer == "srgb" else pixels
 
@@ -58,6 +65,21 @@ def decode(data: bytes, transfer: Transfer, *, memory: int) -> Codes | Floats:
 def decode_file(file: BinaryIO, transfer: Transfer, memory: int) -> Iterator[Codes | Floats]:
     """The same for `workflows.untrusted.decoder.Decoder.picture`."""
     yield decode(file.read(), transfer, memory=memory)
+
+
+def _check_numbers(light: Floats) -> None:
+    """Refuse light that is NaN, which would spoil every pixel that sees it."""
+    rows, columns = np.nonzero(np.isnan(light).any(axis=2))
+    if rows.size:
+        raise ImageError(
+            f"the image has no number (NaN) in {rows.size} of its pixels, first at x = {columns[0]}, y = {rows[0]}: "
+            "replace them, and export it again"
+        )
+
+
+def _clip(light: Floats) -> Floats:
+    """Clip light to `MOST_LIGHT`, in place."""
+    return np.clip(light, -MOST_LIGHT, MOST_LIGHT, out=light)
 
 
 def _to_srgb(data: bytes, pixels: Codes) -> Codes:

@@ -149,6 +149,11 @@ def test_a_window_lies_in_the_matte(dense: Dense, crop: tuple[int, int, int, int
     assert caught.value.fields["field"] == field
 
 
+def test_a_window_beyond_the_matte_is_of_no_length(dense: Dense) -> None:
+    with pytest.raises(OptionError, match="a crop from x = 40 does not lie inside"):
+        Window.of(dense[0], x=40)
+
+
 def test_blocks_not_yet_recovered_are_left_out(dense: Dense) -> None:
     matte, *_ = dense
     backdrop = np.ones((4, 6, 3), np.float32)

@@ -178,6 +178,22 @@ def test_light_in_acescg_is_that_in_rec_709() -> None:
     np.testing.assert_array_equal(as_it_is, aces)
 
 
+def test_a_sun_that_overflows_is_bright_in_acescg_too() -> None:
+    light = np.full((5, 7, 3), 0.5, np.float32)
+    light[1, 2] = np.inf
+    found = decode.decode(exr_of(light, ACES), "srgb", memory=MEMORY)
+    np.testing.assert_allclose(found[1, 2], decode.MOST_LIGHT, rtol=1e-3)
+    np.testing.assert_allclose(found[0, 0], 0.5, rtol=1e-3)
+
+
+def test_nan_is_refused_by_its_first_pixel() -> None:
+    light = np.ones((5, 7, 3), np.float32)
+    light[4, 1] = light[3, 6, 2] = np.nan
+    message = r"no number \(NaN\) in 2 of its pixels, first at x = 6, y = 3: replace them"
+    with pytest.raises(ImageError, match=message):
+        decode.decode(float_formats.encode_exr("RGB", light), "srgb", memory=MEMORY)
+
+
 def test_rec_709_and_grey_are_left_as_they_are() -> None:
     light = np.random.default_rng(2).random((5, 7, 3)).astype(np.float32)
     named = exr_of(light, tuple(float_formats.REC_709.tolist()))

@@ -18,8 +18,6 @@ from workflows.threads import in_parts
 
 ROWS = 64
 """Rows of cells that a thread computes at a time."""
-MOST = np.float32(np.finfo(np.float16).max)
-"""The largest light, of either sign: what pictures of 16-bit floats hold. Sums of much larger values would overflow."""
 
 
 @dataclass(frozen=True)
@@ -44,21 +42,17 @@ def backdrop_of(pixels: Codes | Floats, transfer: Transfer) -> Backdrop:
     Parameters
     ----------
     pixels : (h, w, 1 to 4) uint8 or uint16, or (h, w, 1 or 3) float32
-        Two or four channels include alpha. Float values are changed in place.
+        Two or four channels include alpha.
     transfer : str
         How integers encode light; float values are linear light.
 
     Returns
     -------
     Backdrop
-        Transparent pixels are black, in proportion, because there is no light behind them. Infinite values and NaN are
-        black, and larger values than `MOST` become it.
+        Transparent pixels are black, in proportion, because there is no light behind them.
     """
     if pixels.dtype == np.float32:
-        light = cast("Floats", pixels)
-        light[~np.isfinite(light)] = 0
-        np.clip(light, -MOST, MOST, out=light)
-        return Backdrop(light)
+        return Backdrop(cast("Floats", pixels))
     codes = cast("Codes", pixels)
     return Backdrop(codes, table(transfer, codes.dtype))
 

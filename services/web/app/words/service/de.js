@@ -262,6 +262,7 @@ export const de = {
 	"the frames are in reverse order": "die Bilder sind in umgekehrter Reihenfolge",
 	"the frames differ from what the patterns explain in ways that are neither a movement of the camera nor a flicker of the light, so these can't be measured": "die Bilder weichen von den Mustern ab, aber weder durch eine Bewegung der Kamera noch durch flackerndes Licht, darum lässt sich beides nicht messen",
 	"the frames do not look like the patterns of the program": "die Bilder sehen nicht aus wie die Muster des Programms",
+	"the image has no number (NaN) in {count} of its pixels, first at x = {x}, y = {y}: replace them, and export it again": "das Bild hat in {count} seiner Pixel keine Zahl (NaN), zuerst bei x = {x}, y = {y}: ersetzen und neu exportieren",
 	"the ingest was cancelled; upload the capture again": "das Einlesen wurde abgebrochen; die Aufnahme neu hochladen",
 	"the light varies by {percent} % between frames, by {worst} % in frame {frame}": "das Licht schwankt von Bild zu Bild um {percent} %, in Bild {frame} um {worst} %",
 	"the monitor showed the patterns at another size than they were made for, as their half-tones tell": "der Monitor hat die Muster in anderer Größe gezeigt, als sie gemacht sind, wie ihre Halbtöne verraten",
