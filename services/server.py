@@ -1,10 +1,12 @@
 """`envmatte serve`: the API, a coordinator and a cluster in one process tree; and `envmatte coordinator`."""
 
 import gc
+import logging
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from threading import Timer
 
 from sqlalchemy import Engine
 
@@ -29,6 +31,9 @@ GRACE = 3
 SWITCH_SECONDS = 0.0005
 """How long a thread keeps the interpreter from others that want it: a tenth of Python's default, so that the event loop
 need not wait for ten of them. It costs what computes a few per cent."""
+SILENCE = 5.0
+"""Seconds without an answer of the store after which a start says what it waits for: a bucket is asked for a minute."""
+logger = logging.getLogger(__name__)
 
 
 def serve(settings: Settings) -> None:
@@ -123,4 +128,19 @@ def _opened(
         stack.callback(engine.dispose)
         keep_reserve(engine)
         objects = Objects(settings.store_url)
-        yield stack, engine, objects, installation.recognise(engine, objects, mark=mark)
+        with _slowness_logged(settings.store_url):
+            id = installation.recognise(engine, objects, mark=mark)
+        yield stack, engine, objects, id
+
+
+@contextmanager
+def _slowness_logged(store: str) -> Iterator[None]:
+    """Log what is waited for if the store does not answer for a while."""
+    message = "the store %s has not answered for %g s: waiting for it. The address of a bucket is AWS_ENDPOINT_URL"
+    timer = Timer(SILENCE, logger.warning, (message, store, SILENCE))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

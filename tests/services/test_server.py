@@ -1,6 +1,8 @@
 """What the processes of a service import: a coordinator alone needs no HTTP API; and what that costs later."""
 
+import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.parts.processes import running
+from tests.services.cli.commands import COMMAND
 
 SEARCHED = """
 import gc, os, signal, time
@@ -46,6 +49,20 @@ def test_no_route_is_imported_before_the_app() -> None:
     assert modules <= loaded
     assert not {name for name in loaded if name.startswith("services.api.")}
     assert not loaded & {"fastapi", "uvicorn"}
+
+
+@pytest.mark.slow
+def test_a_start_says_that_it_waits_for_the_store(tmp_path: Path) -> None:
+    with socket.socket() as silent:  # takes connections, and answers none
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        keys = {"AWS_ENDPOINT_URL": url, "AWS_ACCESS_KEY_ID": "somebody", "AWS_SECRET_ACCESS_KEY": "secret"}
+        options = ["--data", str(tmp_path), "--port", "0", "--store", "s3://bucket/prefix"]
+        with running([*COMMAND, "serve", *options], env=os.environ | keys) as service:
+            assert service.stderr is not None
+            lines = iter(service.stderr.readline, "")
+            assert any("the store s3://bucket/prefix has not answered for 5 s" in line for line in lines)
 
 
 @pytest.mark.slow
