@@ -136,7 +136,9 @@ def _opened(
 @contextmanager
 def _slowness_logged(store: str) -> Iterator[None]:
     """Log what is waited for if the store does not answer for a while."""
-    message = "the store %s has not answered for %g s: waiting for it. The address of a bucket is AWS_ENDPOINT_URL"
+    message = (
+        "the store %s has not answered for %g s: waiting for it. The address of a bucket is AWS_ENDPOINT_URL"
+    )
     timer = Timer(SILENCE, logger.warning, (message, store, SILENCE))
     timer.daemon = True
     timer.start()

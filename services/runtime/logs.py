@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 import threading
+from asyncio import CancelledError
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -74,6 +75,7 @@ def configure_logging(form: str, level: str, role: str) -> None:
     logging.getLogger("distributed").setLevel(max(logging.WARNING, LEVELS[level]))
     logging.getLogger("alembic").setLevel(logging.WARNING)  # it has an INFO line for every step
     logging.getLogger("uvicorn.error").addFilter(_is_news)
+    logging.getLogger("distributed.client").addFilter(_is_an_error)
     sys.excepthook = _log_uncaught
     threading.excepthook = lambda args: logger.critical(
         "thread %s ended by an error", args.thread, exc_info=args.exc_value
@@ -120,6 +122,11 @@ def _is_news(record: logging.LogRecord) -> bool:
     """Whether a line of uvicorn says more than ours: why an answer ends early, or fails, is logged where it does."""
     logged = record.exc_info and hasattr(record.exc_info[1], LOGGED)
     return not logged and "returned without completing response" not in record.getMessage()
+
+
+def _is_an_error(record: logging.LogRecord) -> bool:
+    """Whether a line of dask's client is about an error: closed while it looks for its scheduler, it was cancelled."""
+    return not (record.exc_info and isinstance(record.exc_info[1], CancelledError))
 
 
 def _log_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

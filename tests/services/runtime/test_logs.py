@@ -20,8 +20,26 @@ except ValueError:
 """
 
 
+CLOSED = """
+import time
+from distributed import Client, LocalCluster
+from services.runtime.logs import configure_logging
+
+cluster = LocalCluster(n_workers=0, processes=False, dashboard_address=None)
+client = Client(cluster.scheduler_address)
+configure_logging("text", "INFO", "test")
+cluster.close()
+time.sleep(0.3)  # it looks for its scheduler now
+client.close()
+"""
+
+
 def logged(form: str) -> str:
-    command = [sys.executable, "-c", SCRIPT.format(form=form)]
+    return run(SCRIPT.format(form=form))
+
+
+def run(script: str) -> str:
+    command = [sys.executable, "-c", script]
     return subprocess.run(command, capture_output=True, timeout=120, check=True).stderr.decode()
 
 
@@ -45,3 +63,7 @@ def test_json_keeps_what_was_sent() -> None:
     first, second = map(json.loads, logged("json").splitlines())
     assert first["message"] == f"failed: {SENT}"
     assert second["exception"].endswith(f"ValueError: {SENT}")
+
+
+def test_client_that_is_closed_while_the_scheduler_is_away_logs_no_error() -> None:
+    assert "CancelledError" not in run(CLOSED)
