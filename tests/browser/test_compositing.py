@@ -109,9 +109,7 @@ def of_url(url: str) -> NDArray[np.float64]:
 
 
 def choose(page: Page, data: bytes, name: str, kind: str) -> None:
-    page.get_by_label("Your own picture or clip").set_input_files(
-        {"name": name, "mimeType": kind, "buffer": data}
-    )
+    page.get_by_label("Picture or clip").set_input_files({"name": name, "mimeType": kind, "buffer": data})
 
 
 def filmed(path: Path, frames: int) -> bytes:

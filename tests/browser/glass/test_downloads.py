@@ -52,7 +52,7 @@ def stage(browser: Browser, service: Service, ready: tuple[str, str]) -> Iterato
 
 
 def choose(page: Page, **files: bytes) -> None:
-    page.get_by_label("Your own picture or clip").set_input_files(
+    page.get_by_label("Picture or clip").set_input_files(
         [
             {"name": name.replace("_", "."), "mimeType": "application/octet-stream", "buffer": data}
             for name, data in files.items()

@@ -10,9 +10,10 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
 from tests.browser.pages import PHONE, SIZE, is_fitting, unfold
+from tests.browser.pages import opened as page_of
 from tests.end_to_end.conftest import BANDS, Service
 from tests.parts.captures import nested_program
 from workflows.programs.presets import preset
@@ -171,8 +172,30 @@ def test_without_a_mask_nothing_can_be_transparent(
     desk: Page, service: Service, ready: tuple[str, str]
 ) -> None:
     opened(desk, service, ready[1])
-    expect(desk.get_by_text("all that is around it was recovered too")).to_be_visible()
-    expect(desk.get_by_label("Transparent around the glass")).to_be_disabled()
+    expect(desk.get_by_label("Transparent around the glass")).to_be_hidden()
+    expect(desk.get_by_text("all that is around the glass was recovered too")).to_be_visible()
+
+
+@pytest.mark.parametrize(
+    ("locale", "folds"),
+    [
+        ("en-GB", ("Placement", "Comparison", "Copy and download")),
+        ("de-DE", ("Lage", "Vergleich", "Kopieren und herunterladen")),
+    ],
+)
+def test_the_controls_folds_are_seen_on_a_small_laptop(
+    browser: Browser, service: Service, masked: str, locale: str, folds: tuple[str, ...]
+) -> None:
+    with page_of(browser, locale=locale, viewport={"width": 1280, "height": 800}) as page:
+        page.goto(f"{service.url}/#/mattes/{masked}")
+        sheet = page.locator(".sheet")
+        expect(sheet.get_by_text(re.compile(": ex"))).to_be_visible()
+        shown = sheet.bounding_box()
+        assert shown
+        for fold in folds:
+            box = sheet.get_by_text(fold, exact=True).bounding_box()
+            assert box
+            assert box["y"] + box["height"] <= shown["y"] + shown["height"] <= 800
 
 
 def test_own_backdrop_stays_among_the_choices(
@@ -182,7 +205,7 @@ def test_own_backdrop_stays_among_the_choices(
     for name, colour in (("sea.png", "blue"), ("hill.png", "green")):
         path = tmp_path / name
         Image.new("RGB", (64, 48), colour).save(path)
-        desk.get_by_label("Your own picture or clip").set_input_files(path)
+        desk.get_by_label("Picture or clip").set_input_files(path)
         expect(desk.get_by_role("radio", name=name)).to_be_checked()
         expect(desk.get_by_text(f"{name}: exact")).to_be_visible()
         thumb = pixels(desk, ".thumb-choice:has(:checked) canvas")
@@ -193,7 +216,7 @@ def test_own_backdrop_stays_among_the_choices(
     desk.get_by_role("radio", name="hill.png").check()
     expect(desk.get_by_text("hill.png: exact")).to_be_visible()
     damaged = {"name": "sky.exr", "mimeType": "", "buffer": b"no picture"}
-    desk.get_by_label("Your own picture or clip").set_input_files(damaged)
+    desk.get_by_label("Picture or clip").set_input_files(damaged)
     expect(desk.get_by_role("alert")).to_be_in_viewport()
     expect(desk.locator(".thumb-choice:has(:checked)")).to_contain_text("exr")
 
@@ -225,7 +248,7 @@ def test_refused_picture_is_said_not_to_be_shown(
 ) -> None:
     opened(desk, service, ready[1])
     before = desk.locator(".picture.stage img").get_attribute("src")
-    desk.get_by_label("Your own picture or clip").set_input_files(
+    desk.get_by_label("Picture or clip").set_input_files(
         {"name": "beach.png", "mimeType": "image/png", "buffer": b"none"}
     )
     expect(desk.get_by_role("alert")).to_contain_text("The image can't be used")

@@ -120,7 +120,7 @@ def test_failures_are_explained_in_german(
             expect(page.get_by_role("main")).to_contain_text("ist abgeschnitten oder beschädigt: neu von der")
             assert "cut off" not in page.evaluate(TEXTS)
         page.goto(f"{service.url}/#/mattes/{ready[1]}")
-        page.get_by_label("Eigenes Bild oder eigenen Clip").set_input_files(
+        page.get_by_label("Bild oder Clip").set_input_files(
             {"name": "beach.png", "mimeType": "image/png", "buffer": b"none"}
         )
         alert = page.get_by_role("alert")

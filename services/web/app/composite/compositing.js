@@ -19,7 +19,7 @@ export function compositing(matte, others, signal) {
 	const stage = new Stage(matte, controls.values, signal);
 	const explained = explanation(stage, matte, signal); // before the keys that move the backdrop: it keeps some to itself
 	handleGestures(stage.element, controls, stage);
-	const around = aroundControl(stage, given.around !== "nothing");
+	const [around, opaque] = aroundControl(stage, given.around !== "nothing");
 	keepInUrl(stage, controls, matte, signal);
 
 	const video = clipJob(matte, () => ({ ...controls.values, around: stage.around ? "backdrop" : "nothing", fit: "frame" }), signal);
@@ -46,21 +46,22 @@ export function compositing(matte, others, signal) {
 		h("div.row", full, play.button, recordButton(stage, matte, signal), explained.button, controls.reset, keys, around),
 		stage.status, explained.panel, choices,
 		folded(t("placement"), h("p.hint", t("placement.how")), controls.sliders),
-		folded(t("compare"), comparison(stage, matte, others)), folded(t("take"), taken.element), video.element, stage.renderer);
+		folded(t("compare"), comparison(stage, matte, others)), folded(t("take"), opaque, taken.element), video.element, stage.renderer);
 	return { section: fillable(stage.element, sheet, full), stage };
 }
 
-// The checkbox that leaves what is around the glass transparent, and why it cannot.
+// The checkbox that leaves what is around the glass transparent, and what says why there is none.
 function aroundControl(stage, around) {
 	const transparent = h("input", { type: "checkbox", checked: !around });
-	const unmasked = h("span.hint", { hidden: true }, t("transparent.none"));
+	const control = h("label", transparent, " ", t("transparent"));
+	const opaque = h("p.hint", { hidden: true }, t("transparent.none"));
 	transparent.onchange = () => stage.putAround(!transparent.checked);
 	stage.element.addEventListener("unmasked", () => {
-		transparent.disabled = true;
-		unmasked.hidden = false;
+		control.hidden = true;
+		opaque.hidden = false;
 	});
 	stage.around = around;
-	return [h("label", transparent, " ", t("transparent")), unmasked];
+	return [control, opaque];
 }
 
 // A reload and a link show the same, as far as the backdrop is a built-in one.

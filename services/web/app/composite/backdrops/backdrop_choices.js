@@ -4,17 +4,20 @@ import { STILLS, isFilm } from "../../upload/archive.js";
 import { onDrop } from "../../upload/upload.js";
 import { builtIn, fromFile } from "./backdrops.js";
 import { NAMES, scenery } from "./scenery.js";
-import { cameraSymbol, choice, thumbOf, thumbs } from "./thumb_choices.js";
+import { cameraSymbol, choice, fileSymbol, thumbOf, thumbs } from "./thumb_choices.js";
 import { cameraBackdrop, clipBackdrop } from "./video_backdrops.js";
-import { parts, t } from "../../lib/words.js";
+import { t } from "../../lib/words.js";
 
 // `use(promise, control)` shows a backdrop, and resolves with it if it can be used; `all` makes composites of several
 // files. Files can be dropped on the stage's element, too. `first` is the built-in one that is checked.
 export function backdropChoices(matte, stage, { use, all, first }, signal) {
 	const builtIns = NAMES.map((name) => choice("backdrop", t(`scene.${name}`), scenery(name, 96, 72).picture, name === first, (control) => use(builtIn(name, matte.monitor), control)));
-	const choices = thumbs(t("backdrop"), [...builtIns, choice("backdrop", t("camera"), cameraSymbol(), false, (control) => use(cameraBackdrop(), control))]);
+	const camera = choice("backdrop", t("camera"), cameraSymbol(), false, (control) => use(cameraBackdrop(), control));
+	const input = fileField({ multiple: true, accept: `${STILLS},video/*,.mts,.m2ts`, title: "" }, take);
+	const file = h("label.thumb-choice", input, h("span.frame", fileSymbol()), h("span", t("backdrop.own")));
+	const choices = thumbs(t("backdrop"), [...builtIns, camera, file]);
 	let own; // the choice of the last file
-	const take = async (files) => {
+	async function take(files) {
 		if (files.length > 1) return all([...files]);
 		const [file] = files;
 		const open = () => (isFilm(file) ? clipBackdrop(file) : fromFile(file));
@@ -27,10 +30,8 @@ export function backdropChoices(matte, stage, { use, all, first }, signal) {
 		choices.lastChild.append((own = next));
 		place.replaceWith(thumbOf(taken));
 		control.checked = true;
-	};
-	const input = fileField({ id: "backdrop", multiple: true, accept: `${STILLS},video/*,.mts,.m2ts` }, take);
+	}
 	onDrop(stage, take);
 	addEventListener("paste", ({ clipboardData }) => clipboardData?.files.length && take(clipboardData.files), { signal });
-	return [choices, h("div.drop.small", h("label", { for: "backdrop" }, parts("backdrop.drop", { own: h("strong", t("backdrop.own")) }),
-		h("span.hint", t("backdrop.what"))), input)];
+	return [choices, h("p.hint", t("backdrop.what"))];
 }
