@@ -18,6 +18,7 @@ from workflows.ingest.report.figures import (
     ToneCurve,
 )
 from workflows.ingest.report.findings import findings
+from workflows.ingest.report.limits import is_blown
 from workflows.programs.program import Program
 
 
@@ -40,7 +41,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
     """
     program = Program.model_validate(attributes["program"])
     quality = None
-    if not attributes.get("order"):
+    if not attributes.get("order") and not is_blown(attributes["survey"]):
         quality = expected(
             program,
             patterns_seen(attributes),

@@ -103,6 +103,15 @@ def test_a_white_that_is_clipped_asks_for_less_exposure(ingest: Ingest, capture_
     assert "expose a stop less" in found["exposure"].remedy
 
 
+def test_nothing_is_promised_where_nearly_all_is_clipped(ingest: Ingest, capture_archive: bytes) -> None:
+    made, found = reported(ingest, filmed(capture_archive, gain=20))
+    assert made.clipping.white > 0.95
+    assert made.quality is None
+    assert "quality" not in found
+    assert "what to expect of composites" in found["unmeasured"].message
+    assert "brighter" not in found["unmeasured"].remedy
+
+
 @pytest.mark.parametrize(
     ("gain", "level", "more"),
     [(0.4, "warning", "a stop more"), (0.1, "bad", "3 stops more")],
