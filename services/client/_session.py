@@ -172,7 +172,9 @@ class Session:
         except httpx2.TransportError as error:
             url = self._http.base_url
             problem = {"title": "No answer", "status": 503}
-            detail = f"no answer from {url}: {error}; is `envmatte serve` running?"
+            plain = "WRONG_VERSION_NUMBER" in str(error)  # what OpenSSL says of an answer that is no TLS
+            remedy = "give its URL with http://" if plain else "is `envmatte serve` running?"
+            detail = f"no answer from {url}: {error}; {remedy}"
             raise Unreachable(problem | {"detail": detail}) from error
 
     def header(self, answer: httpx2.Response, name: str) -> str:

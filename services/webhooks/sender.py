@@ -114,6 +114,8 @@ class Sender:
         try:
             status = safe_http.post(row.url, body, headers, private=self._private)
             accepted, outcome = 200 <= status < 300, f"answered with {status}"
+            if 300 <= status < 400:
+                outcome += ", a redirect, and none is followed"
         except (OSError, http.client.HTTPException, ValueError) as error:
             accepted, outcome = False, f"no answer: {str(error)[:LONGEST]}"
         try:

@@ -198,6 +198,15 @@ def test_redirect_says_where_it_leads() -> None:
     assert len(calls) == 1
 
 
+def test_tls_to_a_service_of_plain_http_says_which_url_to_give() -> None:
+    with (
+        scripted_server(lambda n: ok()) as (url, _),
+        Client(url.replace("http://", "https://")) as client,
+        pytest.raises(Unreachable, match=r"give its URL with http://$"),
+    ):
+        client.job("j")
+
+
 @pytest.mark.parametrize("proxy", ["http://127.0.0.1:9", "socks://127.0.0.1:9", "nonsense:proxy"])
 def test_service_on_loopback_is_reached_without_a_proxy(monkeypatch: pytest.MonkeyPatch, proxy: str) -> None:
     for name in ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"):

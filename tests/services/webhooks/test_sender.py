@@ -62,6 +62,16 @@ def test_only_the_coordinator_with_the_lease_sends(engine: Engine) -> None:
     assert len(found.received) == 1
 
 
+def test_redirect_is_said_not_to_be_followed(engine: Engine) -> None:
+    token = lease(engine)
+    with (
+        receiver(lambda n: 301, Location="https://glass.example/") as found,
+        Sender(settings(), engine, lambda: token),
+    ):
+        line = wait_for_log(engine, ended(engine, found.url))
+    assert line == "webhook, attempt 1: answered with 301, a redirect, and none is followed; again in 5 s"
+
+
 def test_delivery_without_answer_is_given_up_after_the_last_attempt(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
