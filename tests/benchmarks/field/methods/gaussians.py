@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
-from scipy.signal import find_peaks
 
 from tests.benchmarks.field.methods.method import (
     Film,
@@ -100,6 +99,8 @@ def _each(lobes: Doubles, at: list[Doubles]) -> Doubles:
 
 def _start(sweeps: list[Doubles], at: list[Doubles], noise: float) -> Doubles:
     """Peaks of the vertical and of the horizontal sweep, paired where the diagonals allow."""
+    from scipy.signal import find_peaks  # takes long to import, and collecting tests does not need it
+
     places, widths = [], []
     for sweep, where in zip(sweeps[:2], at[:2], strict=True):
         least = max(4 * noise, 0.05 * sweep.max())
