@@ -4,7 +4,8 @@ Each part is an object ``uploads/ID/NAME.part``, because objects in a bucket can
 which parts belong to an upload, and in which order. A part is stored first and recorded then: a writer that is killed
 in between leaves an object that nothing refers to, and of two writers at the same offset the first to record its part
 wins. A complete upload gets an index, ``uploads/ID/parts.json``, for workers, which do not use the database. An upload
-that becomes a capture keeps its id and its place.
+that becomes a capture keeps its id and its place. While a film is ingested, ``uploads/ID/sums/NAME`` are sums of its
+frames, see `workflows.ingest.plateau_sums`; they are removed with it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from storage.objects.store import Objects
 
 INDEX = "parts.json"
+SUMS = "sums"
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,21 @@ def remove(objects: Objects, upload: str) -> None:
 def seal(objects: Objects, upload: str, parts: Sequence[Part]) -> None:
     """Write the index of a complete upload, which `read` needs."""
     objects.put(f"{path(upload)}/{INDEX}", json.dumps([[part.name, part.size] for part in parts]).encode())
+
+
+def put_sum(objects: Objects, upload: str, name: str, data: bytes) -> None:
+    """Keep a sum of frames of an archive's film until it is ingested."""
+    objects.put(f"{path(upload)}/{SUMS}/{name}", data)
+
+
+def sums(objects: Objects, upload: str) -> set[str]:
+    """The names of all that `put_sum` has kept."""
+    return set(objects.names(f"{path(upload)}/{SUMS}"))
+
+
+def read_sum(objects: Objects, upload: str, name: str) -> BinaryIO:
+    """A file over what `put_sum` has kept."""
+    return objects.read(f"{path(upload)}/{SUMS}/{name}")
 
 
 def read(objects: Objects, upload: str) -> BinaryIO:

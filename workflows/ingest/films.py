@@ -1,23 +1,29 @@
 """Read the film of a capture, or a clip, in a decoder."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from fractions import Fraction
-from typing import Annotated, Any, BinaryIO
+from itertools import groupby
+from typing import Annotated, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from workflows.images import hdr
+from workflows.ingest.plateau_sums import PlateauSums, from_bytes, name_of, to_bytes
 from workflows.ingest.video.clip import Clip, open_clip
-from workflows.ingest.video.frame_means import Share, mean_frames
-from workflows.ingest.video.signatures import CELLS, LARGE_CELLS, LargeFrames, Signatures, take_signatures
+from workflows.ingest.video.frame_means import Share, mean_frames, mean_of
+from workflows.ingest.video.signatures import CELLS, LARGE_CELLS, LargeFrames, Signatures, SmallCopies
 from workflows.untrusted.decoder import Decoder, blaming
 
 Positive = Annotated[int, Field(ge=1)]
 THREADS = 4
 """Threads that decode a film from its first frame to its last, when no other worker can help: with two, a core of two
 waits while small copies are made, and a film of 76 s in full HD takes 13.1 s rather than 11.6."""
+
+WAITING = 2
+"""Pictures of the largest size that may wait until their plateau has ended: 80 frames of full HD."""
+_SHARES = TypeAdapter(list[Share])
 
 
 class Film(BaseModel):
@@ -55,8 +61,38 @@ class Film(BaseModel):
         return Fraction(self.numerator, self.denominator)
 
 
+class KeepSums(NamedTuple):
+    """Where the sums of plateaus are kept, see `workflows.ingest.plateau_sums`.
+
+    Attributes
+    ----------
+    hold : float
+        About how long a pattern is shown, in seconds.
+    most : int
+        How many sums are kept, at most.
+    put : callable
+        Keeps a sum by its name.
+    """
+
+    hold: float
+    most: int
+    put: Callable[[str, bytes], None]
+
+
+class KeptSums(NamedTuple):
+    """The sums that were kept: their names, and what opens one by its name."""
+
+    names: Container[str]
+    read: Callable[[str], BinaryIO]
+
+
 def scan(
-    decoder: Decoder, file: BinaryIO, entry: str, max_bytes: int, every: float | None
+    decoder: Decoder,
+    file: BinaryIO,
+    entry: str,
+    max_bytes: int,
+    every: float | None,
+    keep: KeepSums | None = None,
 ) -> tuple[Film, Signatures, NDArray[np.int64], LargeFrames]:
     """Read all of a film, for `workflows.ingest.video.matching`.
 
@@ -66,12 +102,14 @@ def scan(
         Bytes that the signatures and large frames may take.
     every : float, optional
         Seconds between large frames; None for none.
+    keep : KeepSums, optional
+        Where to keep the sums of plateaus.
 
     Returns
     -------
     film : Film
     signatures, ticks, large
-        As of `workflows.ingest.video.signatures.take_signatures`.
+        As of `workflows.ingest.video.signatures.SmallCopies`.
 
     Raises
     ------
@@ -80,10 +118,16 @@ def scan(
     """
     with blaming(entry, decoder):
         answers = decoder.run(
-            _scan, file, entry=entry, memory=decoder.image_bytes, max_bytes=max_bytes, every=every
+            _scan,
+            file,
+            entry=entry,
+            memory=decoder.image_bytes,
+            max_bytes=max_bytes,
+            every=every,
+            hold=keep and keep.hold,
         )
         with decoder.checking():
-            found, signatures, ticks, grey, frames = answers
+            found, signatures, ticks, grey, frames = answers if keep is None else _without_sums(answers, keep)
             film = Film.model_validate(found)
             _require_grid(signatures, len(ticks), CELLS, 4)
             _require_grid(grey, len(frames), LARGE_CELLS, 3)
@@ -93,6 +137,21 @@ def scan(
                 if not 0 <= frames[0] <= frames[-1] < len(ticks):
                     raise ValueError("a large frame is none of the film")
             return film, signatures, ticks, LargeFrames(grey, frames.astype(np.intp))
+
+
+def _without_sums(answers: Iterator[Any], keep: KeepSums) -> Iterator[Any]:
+    """What a decoder answers beside the sums, which are kept."""
+    kept = 0
+    for answer in answers:
+        if not isinstance(answer, dict) or "shares" not in answer:
+            yield answer
+            continue
+        shares, total = _SHARES.validate_python(answer["shares"]), next(answers, None)
+        kept += 1
+        if not isinstance(total, np.ndarray) or total.ndim != 1 or kept > keep.most:
+            raise ValueError("a sum is missing, or there are too many")
+        # What is in it is looked at by no one but another decoder.
+        keep.put(name_of(shares), total.tobytes())
 
 
 def times(
@@ -147,6 +206,7 @@ def means(
     width: int,
     height: int,
     full: float = 1.0,
+    kept: KeptSums | None = None,
 ) -> Iterator[NDArray[np.uint16]]:
     """Weighted means of frames, see `workflows.ingest.video.frame_means.mean_frames`.
 
@@ -156,26 +216,45 @@ def means(
         Size of the frames, upright.
     full : float
         The light of HDR that becomes full scale.
+    kept : KeptSums, optional
+        Sums of frames that need not be decoded again.
 
     Raises
     ------
     CaptureError
         If a frame can't be decoded again.
     """
+    given: dict[str, Any] = {"entry": entry, "memory": decoder.image_bytes, "full": full}
+
+    def is_kept(shares: Sequence[Share]) -> bool:
+        return kept is not None and name_of(shares) in kept.names
+
     with blaming(entry, decoder):
-        answers = decoder.run(_means, file, entry=entry, memory=decoder.image_bytes, plan=plan, full=full)
-        for _ in plan:
-            with decoder.checking():
-                mean = next(answers, None)
-                if (
-                    not isinstance(mean, np.ndarray)
-                    or mean.dtype != np.uint16
-                    or mean.shape != (height, width, 3)
-                ):
-                    raise ValueError("a mean is missing, or has another size")
-            yield mean
+        for there, group in groupby(plan, is_kept):
+            some = list(group)
+            if kept is None or not there:
+                yield from _pictures(
+                    decoder, decoder.run(_means, file, plan=some, **given), some, (height, width)
+                )
+                continue
+            for shares in some:
+                with kept.read(name_of(shares)) as total:
+                    answers = decoder.run(_mean_of_sum, total, whole=True, full=full)
+                    yield from _pictures(decoder, answers, [shares], (height, width))
+
+
+def _pictures(
+    decoder: Decoder, answers: Iterator[Any], plan: Sequence[Sequence[Share]], size: tuple[int, int]
+) -> Iterator[NDArray[np.uint16]]:
+    """The means that a decoder answers, one for each of a plan."""
+    for _ in plan:
         with decoder.checking():
-            () = answers
+            mean = next(answers, None)
+            if not isinstance(mean, np.ndarray) or mean.dtype != np.uint16 or mean.shape != (*size, 3):
+                raise ValueError("a mean is missing, or has another size")
+        yield mean
+    with decoder.checking():
+        () = answers
 
 
 def _require_grid(values: Any, count: int, most: tuple[int, int], dimensions: int) -> None:
@@ -198,11 +277,19 @@ def _require_ascending(values: Any) -> None:
 
 
 def _scan(
-    file: BinaryIO, entry: str, memory: int, max_bytes: int, every: float | None
+    file: BinaryIO, entry: str, memory: int, max_bytes: int, every: float | None, hold: float | None
 ) -> Iterator[dict[str, Any] | NDArray[Any]]:
     with open_clip(file, entry, memory, THREADS) as clip:
-        found = take_signatures(clip, max_bytes, np.inf if every is None else every)
-        signatures, ticks, large = found
+        copies = SmallCopies(clip, max_bytes, np.inf if every is None else every)
+        sums = None if hold is None else PlateauSums(clip, hold, WAITING * memory)
+        for frame in clip.frames():
+            signature = copies.add(frame)
+            for shares, total in sums.add(frame, signature) if sums else ():
+                packed = to_bytes(total)
+                if packed.nbytes <= memory:
+                    yield {"shares": shares}
+                    yield packed
+        signatures, ticks, large = copies.taken()
         yield _film(clip, ticks)
     yield signatures
     yield ticks
@@ -225,6 +312,10 @@ def _means(
 ) -> Iterator[NDArray[np.uint16]]:
     with open_clip(file, entry, memory) as clip:
         yield from mean_frames(clip, [[Share(*share) for share in shares] for shares in plan], full)
+
+
+def _mean_of_sum(file: BinaryIO, full: float) -> Iterator[NDArray[np.uint16]]:
+    yield mean_of(from_bytes(file), full)
 
 
 def _film(clip: Clip, ticks: NDArray[np.int64]) -> dict[str, Any]:

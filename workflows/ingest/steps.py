@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,9 @@ from workflows.programs.parts import Images
 from workflows.untrusted.decoder import Decoder
 from workflows.untrusted.limits import Limits
 
+MOST_SUMS = 2
+"""Plateaus of a film whose frames are added up, at most, for each pattern."""
+
 
 def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     """Check the archive of a capture, match a video to its patterns, and create the empty stack.
@@ -57,7 +61,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
         found = (
             _examine_stills(decoder, archive)
             if manifest.video is None
-            else _examine_film(decoder, archive, manifest.video, patterns, limits)
+            else _examine_film(objects, task, decoder, archive, manifest.video, patterns)
         )
         mask = None if manifest.mask is None else _decode_mask(decoder, archive, manifest.mask, found)
     _check_size(manifest, found, limits)
@@ -157,11 +161,12 @@ def _examine_stills(decoder: Decoder, archive: CaptureArchive) -> _Frames:
 
 
 def _examine_film(
+    objects: Objects,
+    task: Task,
     decoder: Decoder,
     archive: CaptureArchive,
     video: Video,
     patterns: Sequence[NDArray[np.float32]],
-    limits: Limits,
 ) -> _Frames:
     """The frames of a film, matched to the patterns."""
     manifest, entry = archive.manifest, video.file
@@ -176,8 +181,18 @@ def _examine_film(
     curve = "srgb" if program.monitor.response == "unknown" else program.monitor.response
     light = coarse_light(program, curve, patterns)
     every = None if video.border is None else 1 / (LOOKS * video.patterns_per_second)
+
+    def put(name: str, data: bytes) -> None:
+        spare = objects.spare_bytes()
+        # Only beside the stack, which takes twice as much. A bucket may be slower than to decode the frames again.
+        if spare is not None and spare > 3 * program.count * len(data):
+            uploads.put_sum(objects, task.capture, name, data)
+
+    keep = films.KeepSums(1 / video.patterns_per_second, MOST_SUMS * program.count + 100, put)
     with archive.open(entry) as file:
-        film, signatures, ticks, large = films.scan(decoder, file, entry, limits.memory // 4, every)
+        film, signatures, ticks, large = films.scan(
+            decoder, file, entry, task.limits.memory // 4, every, keep
+        )
     tick = float(film.time_base)
     expected = Expected(program, light, video, manifest.unfinished)
     filmed = match_frames(signatures, ticks, tick, large, expected)
@@ -242,7 +257,7 @@ def work(objects: Objects, task: Task, tile: int) -> int:
     frames = np.empty((last - first, stack.height, stack.width, stack.channels), stack.dtype)
     with uploads.read(objects, task.capture) as file, Decoder(task.limits.image_bytes) as decoder:
         archive = CaptureArchive(file, task.limits)
-        for n, pixels in enumerate(_pixels(decoder, archive, stack, first, last)):
+        for n, pixels in enumerate(_pixels(objects, task.capture, decoder, archive, stack, first, last)):
             frames[n] = pixels
     write_slab(objects, task.capture, first, frames)
     return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
@@ -295,7 +310,13 @@ STEPS = Steps("ingest", "reading", prepare, work, missing, finish, scattered=Fal
 
 
 def _pixels(
-    decoder: Decoder, archive: CaptureArchive, stack: Stack, first: int, last: int
+    objects: Objects,
+    capture: str,
+    decoder: Decoder,
+    archive: CaptureArchive,
+    stack: Stack,
+    first: int,
+    last: int,
 ) -> Iterator[integer_formats.Codes]:
     """The frames of a stack from ``first`` up to ``last``."""
     video = archive.manifest.video
@@ -303,8 +324,9 @@ def _pixels(
         shares = stack.shares()
         plan = [[Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in range(first, last)]
         full = stack.attributes["storage"]["full"]
+        kept = films.KeptSums(uploads.sums(objects, capture), partial(uploads.read_sum, objects, capture))
         with archive.open(video.file) as file:
-            yield from films.means(decoder, file, video.file, plan, stack.width, stack.height, full)
+            yield from films.means(decoder, file, video.file, plan, stack.width, stack.height, full, kept)
         return
     shape = (stack.height, stack.width, stack.channels)
     storage = stills.Storage(stack.dtype, **stack.attributes["storage"])

@@ -1,9 +1,10 @@
 """Weighted means of a video's frames: one RGB image of 16 bits for each pattern."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from av.video.format import VideoFormat
 from av.video.frame import VideoFrame
 from av.video.plane import VideoPlane
 from av.video.reformatter import ColorRange, Colorspace, Interpolation
@@ -37,6 +38,41 @@ class Share(NamedTuple):
     weight: int
 
 
+class Look(NamedTuple):
+    """How the planes of a frame become RGB.
+
+    Attributes
+    ----------
+    format : str
+        A key of `PLANAR`.
+    width, height : int
+        Before rotation.
+    matrix, range, transfer, primaries : int
+        The colour system (ITU-T H.273, tables 2 to 4) and the range, as FFmpeg numbers them.
+    interlaced : bool
+        Whether every second row is of another time, and has colours of its own.
+    quarter_turns : int
+        Counterclockwise, to an upright picture.
+    """
+
+    format: str
+    width: int
+    height: int
+    matrix: int
+    range: int
+    transfer: int
+    primaries: int
+    interlaced: bool
+    quarter_turns: int
+
+
+class FrameSum(NamedTuple):
+    """A weighted sum of frames: each of their planes, (rows, columns) uint16 or uint32, and what they stand for."""
+
+    planes: list[NDArray[Any]]
+    look: Look
+
+
 def mean_frames(
     clip: Clip, plan: Sequence[Sequence[Share]], full: float = 1.0
 ) -> Iterator[NDArray[np.uint16]]:
@@ -62,8 +98,9 @@ def mean_frames(
     """
     frames = clip.frames_from(plan[0][0].tick)
     frame = next(frames, None)
-    for shares in plan:
-        sums: list[NDArray[Any]] = []
+
+    def weighted(shares: Sequence[Share]) -> Iterator[tuple[VideoFrame, int]]:
+        nonlocal frame
         for tick, weight in shares:
             while frame is not None and tick_of(frame) < tick:
                 frame = next(frames, None)
@@ -73,18 +110,53 @@ def mean_frames(
                     "damaged there. Copy it again from the camera",
                     entry=clip.entry,
                 )
-            seen = _planar(frame)
-            planes = _planes(seen)
-            if not sums:
-                # TOTAL_WEIGHT times a code of 8 bits just fits into 16.
-                kind = np.uint16 if planes[0].dtype == np.uint8 else np.uint32
-                sums = [np.zeros(plane.shape, kind) for plane in planes]
-            for total, plane in zip(sums, planes, strict=True):
-                total += np.multiply(plane, weight, dtype=total.dtype)
-        rgb = _to_rgb(sums, seen)
-        if is_hdr(seen.color_trc):
-            rgb = to_srgb(rgb, seen.color_trc, seen.color_primaries, full)
-        yield np.ascontiguousarray(np.rot90(rgb, clip.quarter_turns))
+            yield frame, weight
+
+    for shares in plan:
+        yield mean_of(add_up(weighted(shares), clip.quarter_turns), full)
+
+
+def add_up(frames: Iterable[tuple[VideoFrame, int]], quarter_turns: int) -> FrameSum:
+    """The sum of frames of one clip, with weights that add up to `TOTAL_WEIGHT`."""
+    sums: list[NDArray[Any]] = []
+    for frame, weight in frames:
+        seen = _planar(frame)
+        planes = _planes(seen)
+        if not sums:
+            # TOTAL_WEIGHT times a code of 8 bits just fits into 16.
+            kind = np.uint16 if planes[0].dtype == np.uint8 else np.uint32
+            sums = [np.zeros(plane.shape, kind) for plane in planes]
+        for total, plane in zip(sums, planes, strict=True):
+            total += np.multiply(plane, weight, dtype=total.dtype)
+    look = Look(
+        seen.format.name,
+        seen.width,
+        seen.height,
+        int(seen.colorspace),
+        int(seen.color_range),
+        int(seen.color_trc),
+        int(seen.color_primaries),
+        bool(seen.interlaced_frame),
+        quarter_turns,
+    )
+    return FrameSum(sums, look)
+
+
+def mean_of(total: FrameSum, full: float) -> NDArray[np.uint16]:
+    """The mean of frames as `mean_frames` yields it, of their sum."""
+    look = total.look
+    rgb = _to_rgb(total)
+    if is_hdr(look.transfer):
+        rgb = to_srgb(rgb, look.transfer, look.primaries, full)
+    return np.ascontiguousarray(np.rot90(rgb, look.quarter_turns))
+
+
+def shares_of(ticks: NDArray[np.int64], weights: NDArray[np.float64]) -> list[Share]:
+    """Weights as integers that add up to `TOTAL_WEIGHT`, by the largest remainder method."""
+    exact = TOTAL_WEIGHT * weights / weights.sum()
+    parts = np.floor(exact).astype(int)
+    parts[np.argsort(parts - exact, kind="stable")[: TOTAL_WEIGHT - parts.sum()]] += 1
+    return [Share(int(tick), int(part)) for tick, part in zip(ticks, parts, strict=True) if part]
 
 
 def _planar(frame: VideoFrame) -> VideoFrame:
@@ -108,41 +180,42 @@ def _values(plane: VideoPlane, kind: np.dtype[Any]) -> NDArray[Any]:
     return rows[:, : plane.width]
 
 
-def _to_rgb(sums: Sequence[NDArray[Any]], like: VideoFrame) -> NDArray[np.uint16]:
-    """(height, width, 3) RGB of planes times `TOTAL_WEIGHT`, in the colour system of the frame ``like``.
+def _to_rgb(total: FrameSum) -> NDArray[np.uint16]:
+    """(height, width, 3) RGB of a sum of frames, before rotation.
 
     Notes
     -----
     Limited range (ITU-R BT.709, sect. 6.10: black 16, white 235, colours 112 about 128) is stretched to full range
     here: swscale takes the white of 16 bits for a little less than white, so that it would never be clipped.
     """
-    name, bits = like.format.name, like.format.components[0].bits
-    full = like.color_range == ColorRange.JPEG or name.startswith(("gray", "yuvj"))
+    look = total.look
+    bits = VideoFormat(look.format).components[0].bits
+    full = look.range == ColorRange.JPEG or look.format.startswith(("gray", "yuvj"))
     step = 2.0 ** (bits - 8)
     planes = []
-    for at, total in enumerate(sums):
+    for at, plane in enumerate(total.planes):
         # The code of black, or of grey in a colour plane; the codes from black to white; the result for `zero`.
         zero, span, level = (128 * step, 224 * step, 32768) if at else (16 * step, 219 * step, 0)
         if full:
             zero, span = (128 * step if at else 0, 2.0**bits - 1)
         scale = 65535 / span
-        scaled = np.multiply(total, np.float32(scale / TOTAL_WEIGHT), dtype=np.float32)
+        scaled = np.multiply(plane, np.float32(scale / TOTAL_WEIGHT), dtype=np.float32)
         scaled += np.float32(level - zero * scale)
         # In place: new memory costs as much as the sums.
         planes.append(np.rint(np.clip(scaled, 0, 65535, out=scaled), out=scaled).astype("<u2"))
-    if not like.interlaced_frame or like.height % 4:
-        return _convert(planes, like)
+    if not look.interlaced or look.height % 4:
+        return _convert(planes, look)
     # Each field has the colours of its own rows.
-    rgb = np.empty((like.height, like.width, 3), np.uint16)
+    rgb = np.empty((look.height, look.width, 3), np.uint16)
     for field in (0, 1):
-        rgb[field::2] = _convert([plane[field::2] for plane in planes], like)
+        rgb[field::2] = _convert([plane[field::2] for plane in planes], look)
     return rgb
 
 
-def _convert(planes: Sequence[NDArray[np.uint16]], like: VideoFrame) -> NDArray[np.uint16]:
+def _convert(planes: Sequence[NDArray[np.uint16]], look: Look) -> NDArray[np.uint16]:
     """(height, width, 3) RGB of planes of 16 bits and full range, of as many rows as the first has."""
-    mean = VideoFrame(like.width, len(planes[0]), PLANAR[like.format.name])
-    mean.colorspace, mean.color_range = like.colorspace, ColorRange.JPEG
+    mean = VideoFrame(look.width, len(planes[0]), PLANAR[look.format])
+    mean.colorspace, mean.color_range = look.matrix, ColorRange.JPEG
     for pixels, plane in zip(planes, mean.planes, strict=True):
         _values(plane, np.dtype("<u2"))[:] = pixels
     rgb = mean.reformat(format="rgb48le", interpolation=ACCURATE)

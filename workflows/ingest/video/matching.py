@@ -13,7 +13,7 @@ from workflows.ingest.video import lead_in, resemblance
 from workflows.ingest.video.border_reader import find_by_numbers
 from workflows.ingest.video.border_spill import without_border
 from workflows.ingest.video.boundaries import Edge
-from workflows.ingest.video.frame_means import TOTAL_WEIGHT, Share
+from workflows.ingest.video.frame_means import Share, shares_of
 from workflows.ingest.video.missing_patterns import Reason, by_reason, ranges, remedy
 from workflows.ingest.video.recording import Recording
 from workflows.ingest.video.signatures import LargeFrames, Signatures
@@ -83,7 +83,7 @@ class MatchedFrames:
 
     Attributes
     ----------
-    shares : dict of int to tuple of Share
+    shares : dict of int to list of Share
         The frames of each pattern that was found.
     record : dict
         What was found, as JSON: ``tick`` in seconds, ``frames`` that were decoded, ``kept`` ones, ``numbered``: whether
@@ -93,7 +93,7 @@ class MatchedFrames:
         The same in words.
     """
 
-    shares: dict[int, tuple[Share, ...]]
+    shares: dict[int, list[Share]]
     record: dict[str, Any]
     notes: list[str]
 
@@ -144,7 +144,7 @@ def match_frames(
     _require_enough(expected, shown, looks, reasons)
     reasons = {number: reason for number, reason in sorted(reasons.items()) if number < shown}
     kept = sorted(looks)
-    shares = {number: _shares(ticks[found.frames[number]], found.weights[number]) for number in kept}
+    shares = {number: shares_of(ticks[found.frames[number]], found.weights[number]) for number in kept}
     record = {
         "tick": tick,
         "frames": len(ticks),
@@ -266,14 +266,6 @@ def _require_enough(
         raise expected.refusal(
             f"only {share:.0%} of the patterns are found: {why}; {remedy(reasons.values())}"
         )
-
-
-def _shares(ticks: NDArray[np.int64], weights: Doubles) -> tuple[Share, ...]:
-    """Weights as integers that add up to `TOTAL_WEIGHT`, by the largest remainder method."""
-    exact = TOTAL_WEIGHT * weights / weights.sum()
-    parts = np.floor(exact).astype(int)
-    parts[np.argsort(parts - exact, kind="stable")[: TOTAL_WEIGHT - parts.sum()]] += 1
-    return tuple(Share(int(tick), int(part)) for tick, part in zip(ticks, parts, strict=True) if part)
 
 
 def _summary(record: Mapping[str, Any], kept: int, count: int) -> str:

@@ -18,6 +18,8 @@ LARGE_CELLS = (128, 96)
 
 Signatures = NDArray[np.uint8]
 """(frames, rows, columns, 3) uint8: mean RGB codes over each cell of a grid, before rotation."""
+Signature = NDArray[np.uint8]
+"""(rows, columns, 3) uint8: one of them."""
 
 
 class LargeFrames(NamedTuple):
@@ -35,10 +37,8 @@ class LargeFrames(NamedTuple):
     frames: NDArray[np.intp]
 
 
-def take_signatures(
-    clip: Clip, max_bytes: int, every: float = math.inf
-) -> tuple[Signatures, NDArray[np.int64], LargeFrames]:
-    """The signature and the time, in ticks, of every frame, and some large frames. This reads all frames of the clip.
+class SmallCopies:
+    """The signatures of all frames of a clip, and some large frames.
 
     Parameters
     ----------
@@ -47,35 +47,56 @@ def take_signatures(
         Bytes that the signatures and large frames may take.
     every : float
         Seconds between large frames; infinite for none.
-
-    Raises
-    ------
-    CaptureError
-        If they take more than ``max_bytes``, or the frames change their size.
     """
-    (columns, rows), (across, down) = (np.minimum(grid, clip.size).tolist() for grid in (CELLS, LARGE_CELLS))
-    found, ticks = [], []
-    large: dict[int, NDArray[np.uint8]] = {}
-    # One for all frames: setting it up takes as long as a frame.
-    small, middle = VideoReformatter(), VideoReformatter()
-    step, due = every / clip.tick, -math.inf
-    for number, frame in enumerate(clip.frames()):
-        found.append(_pixels(small.reformat(frame, columns, rows, "rgb24", interpolation=Interpolation.AREA)))
-        ticks.append(tick_of(frame))
-        if step < math.inf and ticks[-1] >= due:
-            due = ticks[-1] + step
-            large[number] = _pixels(
-                middle.reformat(frame, across, down, "gray", interpolation=Interpolation.AREA)
+
+    def __init__(self, clip: Clip, max_bytes: int, every: float = math.inf) -> None:
+        self._entry, self._max_bytes, self._step = clip.entry, max_bytes, every / clip.tick
+        (self._columns, self._rows), (self._across, self._down) = (
+            np.minimum(grid, clip.size).tolist() for grid in (CELLS, LARGE_CELLS)
+        )
+        self._found: list[Signature] = []
+        self._ticks: list[int] = []
+        self._large: dict[int, NDArray[np.uint8]] = {}
+        self._due = -math.inf
+        # One for all frames: setting it up takes as long as a frame.
+        self._small, self._middle = VideoReformatter(), VideoReformatter()
+
+    def add(self, frame: VideoFrame) -> Signature:
+        """Take the next frame; returns its signature.
+
+        Raises
+        ------
+        CaptureError
+            If there are more than ``max_bytes`` of them.
+        """
+        signature = _pixels(
+            self._small.reformat(frame, self._columns, self._rows, "rgb24", interpolation=Interpolation.AREA)
+        )
+        tick = tick_of(frame)
+        if self._step < math.inf and tick >= self._due:
+            self._due = tick + self._step
+            self._large[len(self._found)] = _pixels(
+                self._middle.reformat(
+                    frame, self._across, self._down, "gray", interpolation=Interpolation.AREA
+                )
             )
-        if len(found) * found[0].nbytes + len(large) * across * down > max_bytes:
+        self._found.append(signature)
+        self._ticks.append(tick)
+        count = len(self._found)
+        if count * signature.nbytes + len(self._large) * self._across * self._down > self._max_bytes:
             raise CaptureError(
-                f"{clip.entry} has more than {len(found)} frames, the most that can be matched to patterns: cut off "
+                f"{self._entry} has more than {count} frames, the most that can be matched to patterns: cut off "
                 "what was recorded before and after the program",
-                entry=clip.entry,
-                limit=len(found),
+                entry=self._entry,
+                limit=count,
             )
-    grey = np.array(list(large.values()), np.uint8).reshape(-1, down, across)
-    return np.stack(found), np.array(ticks, np.int64), LargeFrames(grey, np.array(list(large), np.intp))
+        return signature
+
+    def taken(self) -> tuple[Signatures, NDArray[np.int64], LargeFrames]:
+        """The signature and the time, in ticks, of every frame, and the large frames."""
+        grey = np.array(list(self._large.values()), np.uint8).reshape(-1, self._down, self._across)
+        large = LargeFrames(grey, np.array(list(self._large), np.intp))
+        return np.stack(self._found), np.array(self._ticks, np.int64), large
 
 
 def _pixels(frame: VideoFrame) -> NDArray[np.uint8]:

@@ -13,7 +13,6 @@ from tests.workflows.ingest.video.camera import interlaced, stated_by_container
 from workflows.images import hdr
 from workflows.ingest.video.clip import Clip
 from workflows.ingest.video.frame_means import ACCURATE, TOTAL_WEIGHT, Share, mean_frames
-from workflows.ingest.video.signatures import take_signatures
 
 
 @pytest.mark.parametrize(
@@ -49,7 +48,7 @@ def test_a_mean_has_the_colours_that_were_filmed(
             box.mux(stream.encode(frame))
         box.mux(stream.encode())
     film = Clip(io.BytesIO(target.getvalue()), "clip", 1 << 24)
-    _, ticks, _ = take_signatures(film, 1 << 24)
+    ticks, _ = film.ticks(9)
     (mean,) = mean_frames(film, [[Share(int(ticks[2]), 100), Share(int(ticks[5]), TOTAL_WEIGHT - 100)]])
     film.close()
     middles = mean[8::16, 8::16]
