@@ -2,14 +2,15 @@
 
 ``captures/ID`` is a zarr group with the arrays ``frames`` (frame, y, x, channel), ``thumbnails`` (frame, row, column),
 the mean values of square blocks of each frame, optionally ``mask`` (y, x), and ``images/N`` (row, column, channel) for
-the patterns that are images. A capture from a video also has ``shares`` (share, column): which frames of the video make
+the patterns that are images. ``strips`` (frame, row, column, channel) of a film with a border are some pixels from all
+over the frames once more. A capture from a video also has ``shares`` (share, column): which frames of the video make
 up each frame of the stack. The attributes of the group hold the manifest, those of its subgroup ``measured`` the
 measurements. The uploaded archive stays where `storage.layout.uploads` has it until its frames are in the stack.
 """
 
 from collections.abc import Coroutine, Sequence
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import zarr
@@ -34,6 +35,21 @@ THUMBNAIL = 80
 """Blocks along the longer side of a frame, at most, whose means are stored."""
 
 
+class Strips(NamedTuple):
+    """Pixels of a frame that are stored once more: those of some rows and columns.
+
+    Attributes
+    ----------
+    rows, columns : (k,) intp
+    wide : int
+        How many of the columns are read at a time.
+    """
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    wide: int
+
+
 def path(capture: str) -> str:
     """Path of a capture in the store."""
     return f"captures/{capture}"
@@ -50,6 +66,7 @@ def create_stack(
     mask: NDArray[np.bool_] | None,
     images: Sequence[NDArray[np.float32]],
     shares: NDArray[np.int64] | None = None,
+    strips: Strips | None = None,
 ) -> int:
     """Create the empty stack of a capture; a repeated call writes the same and leaves frames written since as they are.
 
@@ -66,6 +83,8 @@ def create_stack(
     images : sequence of (rows, columns, 1 or 3) float32
     shares : (k, 3) int64, optional
         For each frame of a video that is used: a frame of the stack, its time in ticks, and its weight.
+    strips : Strips, optional
+        The pixels to store once more, for `Stack.read_strips`.
 
     Returns
     -------
@@ -106,6 +125,17 @@ def create_stack(
         dimension_names=("frame", "row", "column"),
     )
     whole: dict[str, Any] = {"config": EVERY_CHUNK, "compressors": CODECS}
+    if strips is not None:
+        rows, columns, wide = strips
+        group.create_array(
+            "strips",
+            shape=(frames, len(rows), len(columns), channels),
+            dtype=dtype,
+            chunks=(slab, len(rows), min(wide, len(columns)), channels),
+            compressors=FRAME_CODECS,
+            attributes={"rows": rows.tolist(), "columns": columns.tolist()},
+            dimension_names=("frame", "row", "column", "channel"),
+        )
     if mask is not None:
         group.create_array("mask", data=mask, dimension_names=("y", "x"), **whole)
     if shares is not None:
@@ -115,7 +145,7 @@ def create_stack(
     if _is_other_grid(objects, capture, stack):
         # Some chunks would lie beyond the new grid, and others hide that a new one was lost. The metadata stays until
         # it is replaced, so if this is interrupted, the next call deletes the rest.
-        for name in ("frames", "thumbnails"):
+        for name in ("frames", "thumbnails", "strips"):
             objects.delete(f"{path(capture)}/{name}/c")
     objects.put_tree(path(capture), layout)
     return slab
@@ -131,14 +161,19 @@ def _is_other_grid(objects: Objects, capture: str, stack: zarr.Array[Any]) -> bo
 
 
 def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.unsignedinteger]) -> None:
-    """Write a slab of whole frames that begins with frame ``first``, and their thumbnails."""
-    stack, thumbnails = gather(
-        objects.array(f"{path(capture)}/frames"), _optional(objects.array(f"{path(capture)}/thumbnails"))
+    """Write a slab of whole frames that begins with frame ``first``, their thumbnails and their strips."""
+    stack, thumbnails, strips = gather(
+        objects.array(f"{path(capture)}/frames"),
+        _optional(objects.array(f"{path(capture)}/thumbnails")),
+        _optional(objects.array(f"{path(capture)}/strips")),
     )
     span = slice(first, first + len(frames))
     # The frames tell whether a slab is there. A stack begun by an earlier version has no thumbnails.
     if thumbnails is not None:
         thumbnails[span] = np.stack([_thumbnail(frame) for frame in frames])
+    if strips is not None:
+        rows, columns = (np.array(strips.attrs[name]) for name in ("rows", "columns"))
+        strips[span] = frames[:, rows[:, np.newaxis], columns]
     stack[span] = frames
 
 
@@ -229,6 +264,13 @@ class Stack:
     ) -> NDArray[Any]:
         """Like `read`, for any rows, columns and frames; each chunk is read once."""
         return np.asarray(self._frames.oindex[frames, rows, columns])
+
+    def read_strips(self, columns: slice) -> NDArray[Any] | None:
+        """Like `read_some`, for the rows of the strips that `create_stack` was given, and some of their columns, but
+        from few chunks; None if it was given none, or by an earlier version.
+        """
+        (found,) = gather(_optional(self._objects.array(f"{self._path}/strips")))
+        return None if found is None else np.asarray(found[:, :, columns])
 
     def read_masked(
         self, rows: slice = slice(None), columns: slice = slice(None)

@@ -18,7 +18,7 @@ from workflows.images.resample import smallest_grid
 from workflows.images.tone_curves import Response
 from workflows.ingest import films, stills
 from workflows.ingest.archive import CaptureArchive
-from workflows.ingest.camera.border_exposure import BorderValues
+from workflows.ingest.camera.border_exposure import BorderValues, strips_of
 from workflows.ingest.camera.calibration import calibrate
 from workflows.ingest.manifest import MANIFEST, Manifest, Video
 from workflows.ingest.pixel_sample import take_sample
@@ -67,6 +67,7 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
     _check_size(manifest, found, limits)
     frames, height, width, _ = found.shape
     storage = found.storage
+    has_border = manifest.video is not None and manifest.video.border is not None
     slab = create_stack(
         objects,
         task.capture,
@@ -81,11 +82,12 @@ def prepare(objects: Objects, task: Task) -> dict[str, Any]:
             else TypeAdapter(Response).dump_python(manifest.response, mode="json"),
             "storage": {"black": storage.black, "full": storage.full, "bounded": storage.bounded},
             **found.attributes,
-            "border": manifest.video is not None and manifest.video.border is not None,
+            "border": has_border,
         },
         mask=mask,
         images=patterns,
         shares=found.shares,
+        strips=strips_of(height, width) if has_border else None,
     )
     size = {"width": width, "height": height, "frames": frames, "video": manifest.video is not None}
     return {"tiles": -(-frames // slab), "slab": slab, "memory": limits.memory, **size, "notes": found.notes}

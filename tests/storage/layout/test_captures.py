@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from storage.errors import Corrupt
 from storage.layout import captures
 from storage.layout.blocks import block_edge
-from storage.layout.captures import Stack, create_stack, write_slab
+from storage.layout.captures import Stack, Strips, create_stack, write_slab
 from storage.objects.store import Objects
 
 SHAPE = (11, 37, 50, 3)
@@ -219,3 +219,21 @@ def test_stack_begun_by_an_earlier_version_has_no_thumbnails(
     stack = Stack(objects, "c")
     assert stack.thumbnails() is None
     np.testing.assert_array_equal(stack.read(), values)
+
+
+def test_strips_are_pixels_of_the_frames(objects: Objects, values: NDArray[np.uint16]) -> None:
+    _, height, width, _ = values.shape
+    strips = Strips(np.arange(1, height, 3), np.arange(0, width, 2), 4)
+    slab = create(objects, "c", values.shape, strips=strips)
+    for first in range(0, len(values), slab):
+        write_slab(objects, "c", first, values[first : first + slab])
+    stack = Stack(objects, "c")
+    for part in (slice(0, 4), slice(3, 9), slice(None)):
+        np.testing.assert_array_equal(
+            stack.read_strips(part), stack.read_some(strips.rows, strips.columns[part])
+        )
+
+
+def test_stack_without_strips_has_none(objects: Objects, values: NDArray[np.uint16]) -> None:
+    create(objects, "c", values.shape)
+    assert Stack(objects, "c").read_strips(slice(None)) is None

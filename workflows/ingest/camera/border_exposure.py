@@ -6,7 +6,7 @@ from typing import NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.layout.captures import Stack
+from storage.layout.captures import Stack, Strips
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.local_gain import Surroundings
@@ -18,7 +18,7 @@ STRIPS, WIDE = 64, 4
 ROWS = 512
 """and the rows of them that are looked at, at most, spread over the frame."""
 AT_ONCE = 8
-"""Strips that are read at a time."""
+"""Strips that are looked at at a time."""
 ROUNDS = 8
 """Rounds of fitting the light of the border and the exposures, one given the other: without veils, then with them."""
 FOLLOWS = (0.5, 0.7)
@@ -74,8 +74,15 @@ class BorderLight(NamedTuple):
     places: NDArray[np.intp]
 
 
+def strips_of(height: int, width: int) -> Strips:
+    """The pixels of a frame among which the border is searched for."""
+    left = np.arange(STRIPS) * width // STRIPS
+    columns = np.unique(np.minimum(np.add.outer(left, np.arange(WIDE)), width - 1))
+    return Strips(np.arange(0, height, -(-height // ROWS)), columns, AT_ONCE * WIDE)
+
+
 class BorderValues:
-    """Values that may see the border of a film, in all frames. To find them, chunks all over the stack are read.
+    """Values that may see the border of a film, in all frames.
 
     Parameters
     ----------
@@ -91,13 +98,11 @@ class BorderValues:
         return cls(stack, Program.model_validate(stack.attributes["program"]))
 
     def __init__(self, stack: Stack, program: Program) -> None:
-        left = np.arange(STRIPS) * stack.width // STRIPS
-        columns = np.unique(np.minimum(np.add.outer(left, np.arange(WIDE)), stack.width - 1))
+        strips = strips_of(stack.height, stack.width)
         bits = border_light(range(program.count))[:, stack.attributes["patterns"]]
         self.design = np.concatenate([np.ones((1, stack.frames)), bits]).T
-        rows = np.arange(0, stack.height, -(-stack.height // ROWS))
-        parts = np.array_split(columns, STRIPS // AT_ONCE)
-        found = [self._follow(stack, rows, some) for some in parts if some.size]
+        firsts = range(0, strips.columns.size, strips.wide)
+        found = [self._follow(stack, strips, slice(first, first + strips.wide)) for first in firsts]
         codes, places, whole = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
         # What hardly varies, as a dark room that compression makes quite black, follows anything.
         kept = np.flatnonzero(whole[0] > VARIES * whole.max(initial=0))
@@ -107,12 +112,16 @@ class BorderValues:
         self.usable = np.asarray(((self.codes > 0) & (self.codes < SHOULDER * top)).all(axis=2))
 
     def _follow(
-        self, stack: Stack, rows: NDArray[np.intp], columns: NDArray[np.intp]
+        self, stack: Stack, strips: Strips, part: slice
     ) -> tuple[Codes, NDArray[np.intp], NDArray[np.float32]]:
-        """The values at some rows and columns that vary as the bits do: (frames, n, channels), their places (2, n), and
-        their variances (1, n).
+        """The values of some strips that vary as the bits do: (frames, n, channels), their places (2, n), and their
+        variances (1, n).
         """
-        codes = stack.read_some(rows, columns).reshape(stack.frames, -1, stack.channels)
+        rows, columns = strips.rows, strips.columns[part]
+        codes = stack.read_strips(part)
+        if codes is None:
+            codes = stack.read_some(rows, columns)  # from chunks all over the frames
+        codes = codes.reshape(stack.frames, -1, stack.channels)
         grey, design = codes.mean(axis=2, dtype=np.float32), self.design.astype(np.float32)
         whole, _, unexplained = _spread(grey, design @ (np.linalg.pinv(design) @ grey), design.shape[1])
         kept = np.flatnonzero((unexplained < 1 - FOLLOWS[0]) & (whole > 0))

@@ -8,6 +8,7 @@ from av.video.format import VideoFormat
 from av.video.frame import VideoFrame
 from av.video.plane import VideoPlane
 from av.video.reformatter import ColorRange, Colorspace, Interpolation
+from numba import njit
 from numpy.typing import NDArray
 
 from storage.errors import CaptureError
@@ -127,7 +128,7 @@ def add_up(frames: Iterable[tuple[VideoFrame, int]], quarter_turns: int) -> Fram
             kind = np.uint16 if planes[0].dtype == np.uint8 else np.uint32
             sums = [np.zeros(plane.shape, kind) for plane in planes]
         for total, plane in zip(sums, planes, strict=True):
-            total += np.multiply(plane, weight, dtype=total.dtype)
+            _add(total, np.ascontiguousarray(plane), weight)
     look = Look(
         seen.format.name,
         seen.width,
@@ -140,6 +141,18 @@ def add_up(frames: Iterable[tuple[VideoFrame, int]], quarter_turns: int) -> Fram
         quarter_turns,
     )
     return FrameSum(sums, look)
+
+
+@njit(
+    ["void(uint16[:, ::1], uint8[:, ::1], uint16)", "void(uint32[:, ::1], uint16[:, ::1], uint32)"],
+    nogil=True,
+    cache=True,
+)
+def _add(total: NDArray[Any], plane: NDArray[Any], weight: int) -> None:
+    """Add a plane times its weight: in one go, while numpy writes the product to memory and reads it again."""
+    for y in range(total.shape[0]):
+        for x in range(total.shape[1]):
+            total[y, x] += plane[y, x] * weight
 
 
 def mean_of(total: FrameSum, full: float) -> NDArray[np.uint16]:

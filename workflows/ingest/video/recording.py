@@ -122,6 +122,9 @@ def _quiet(change: Doubles, times: Doubles, hold: float) -> Doubles:
         np.searchsorted(middle, middle - hold / 2),
         np.searchsorted(middle, middle + hold / 2, "right"),
     )
-    noise = np.array([np.quantile(change[a:b], _QUIET) for a, b in zip(first, last, strict=True)])
+    noise, count = np.empty(len(change)), last - first
+    for size in np.unique(count).tolist():  # all frames but the outer ones, if they come evenly: at once
+        at = np.flatnonzero(count == size)
+        noise[at] = np.quantile(change[first[at, np.newaxis] + np.arange(size)], _QUIET, axis=1)
     # Where a codec repeats the picture, there is no noise at all for a while.
     return np.asarray(np.maximum(noise, np.median(noise) / 2 if noise.size else 0))

@@ -69,6 +69,9 @@ class Film:
         self.codes = np.pad(self.codes, ((0, 0), (dark, dark), (dark, dark), (0, 0)))
         self.height, self.width = self.codes.shape[1:3]
 
+    def read_strips(self, columns: slice) -> None:
+        """As of a stack without strips."""
+
     def read_some(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.uint16]:
         return self.codes[:, rows][:, :, columns]
 

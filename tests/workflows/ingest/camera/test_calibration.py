@@ -64,6 +64,9 @@ class Film:
     def read_frames(self, frames: list[int], rows: slice, columns: slice) -> NDArray[np.uint16]:
         return self.codes[frames, rows, columns]
 
+    def read_strips(self, columns: slice) -> None:
+        """As of a stack without strips."""
+
     def read_some(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.uint16]:
         return self.codes[:, rows][:, :, columns]
 
