@@ -59,7 +59,7 @@ def seal(objects: Objects, upload: str, parts: Sequence[Part]) -> None:
     objects.put(f"{path(upload)}/{INDEX}", json.dumps([[part.name, part.size] for part in parts]).encode())
 
 
-def put_sum(objects: Objects, upload: str, name: str, data: bytes) -> None:
+def put_sum(objects: Objects, upload: str, name: str, data: memoryview) -> None:
     """Keep a sum of frames of an archive's film until it is ingested."""
     objects.put(f"{path(upload)}/{SUMS}/{name}", data)
 

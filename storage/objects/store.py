@@ -211,7 +211,7 @@ class Objects:
         """Write an object piece by piece, without storing checksums; after an exception there is no object."""
         byte_objects.write_raw(self._store, path, pieces)
 
-    def put(self, path: str, data: bytes) -> None:
+    def put(self, path: str, data: bytes | memoryview) -> None:
         """Write a small object and its checksums.
 
         Raises

@@ -76,7 +76,7 @@ class KeepSums(NamedTuple):
 
     hold: float
     most: int
-    put: Callable[[str, bytes], None]
+    put: Callable[[str, memoryview], None]
 
 
 class KeptSums(NamedTuple):
@@ -151,7 +151,7 @@ def _without_sums(answers: Iterator[Any], keep: KeepSums) -> Iterator[Any]:
         if not isinstance(total, np.ndarray) or total.ndim != 1 or kept > keep.most:
             raise ValueError("a sum is missing, or there are too many")
         # What is in it is looked at by no one but another decoder.
-        keep.put(name_of(shares), total.tobytes())
+        keep.put(name_of(shares), total.data)
 
 
 def times(

@@ -184,7 +184,7 @@ def _examine_film(
     light = coarse_light(program, curve, patterns)
     every = None if video.border is None else 1 / (LOOKS * video.patterns_per_second)
 
-    def put(name: str, data: bytes) -> None:
+    def put(name: str, data: memoryview) -> None:
         spare = objects.spare_bytes()
         # Only beside the stack, which takes twice as much. A bucket may be slower than to decode the frames again.
         if spare is not None and spare > 3 * program.count * len(data):

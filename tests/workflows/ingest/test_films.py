@@ -158,7 +158,7 @@ SUM = [{"shares": [[0, 257]]}, np.zeros(9, np.uint8)]
 def test_sums_that_are_none_or_too_many_end_the_decoder(
     decoder: Decoder, monkeypatch: pytest.MonkeyPatch, sums: list[Any]
 ) -> None:
-    kept: dict[str, bytes] = {}
+    kept: dict[str, memoryview] = {}
     keep = films.KeepSums(0.5, 1, kept.__setitem__)
     answers: list[Any] = [*films._scan(io.BytesIO(FILM), "film.mp4", IMAGE, IMAGE, 0.2, None)]
     monkeypatch.setattr(decoder, "run", lambda *_, **__: iter([*SUM, *answers]))

@@ -160,10 +160,12 @@ def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
     left, right = border.thickness / 2, border.width - border.thickness / 2
     x, y = np.array([(left, top), (left, bottom), (right, top), (right, bottom)]).T
     cells = (*border.top, *border.bottom, *border.left, *border.right)
+    # A pixel of all plateaus lies together: it is looked up hundreds of times.
+    light = np.ascontiguousarray(light.transpose(1, 2, 0))
 
     def alike(moved: Doubles) -> float:
         pairs = _cells(light, fit_homography(x, y, ends + moved.reshape(4, 2)), cells)
-        return -float(np.abs(pairs[:, ::2] - pairs[:, 1::2]).mean())
+        return -float(np.abs(pairs[::2] - pairs[1::2]).mean())
 
     simplex = np.concatenate([np.zeros((1, 8)), _SIMPLEX * np.eye(8)])
     from scipy.optimize import minimize  # takes half a second to import, and only videos need it
@@ -178,7 +180,10 @@ def _adjusted(light: Floats, ends: Points, border: Border) -> Doubles:
 
 
 def _cells(light: Floats, homography: Doubles, cells: Sequence[Box]) -> Doubles:
-    """Mean light of the inner half of each cell, (plateaus, cells), interpolated linearly; 0 outside of the frame."""
+    """Mean light of the inner half of each cell, (cells, plateaus), interpolated linearly; 0 outside of the frame.
+
+    Unlike elsewhere, light is (rows, columns, plateaus).
+    """
     box = np.array(cells, float)
     x = box[:, 0, None, None] + box[:, 2, None, None] * np.array(_WITHIN)[:, None]
     y = box[:, 1, None, None] + box[:, 3, None, None] * np.array(_WITHIN)[None, :]
@@ -186,23 +191,24 @@ def _cells(light: Floats, homography: Doubles, cells: Sequence[Box]) -> Doubles:
     across, down, scale = np.tensordot(homography, np.stack([x, y, np.ones_like(x)]), 1)
     # The value of a pixel belongs to its centre.
     u, v = across / scale - 0.5, down / scale - 0.5
-    height, width = light.shape[1:]
+    height, width = light.shape[:2]
     inside = (u > -1) & (v > -1) & (u < width) & (v < height) & (scale > 0)
     u, v = np.clip(np.where(inside, u, 0), 0, width - 1), np.clip(np.where(inside, v, 0), 0, height - 1)
     i, j = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
-    a, b = u - i, v - j
-    values = (light[:, j, i] * (1 - a) + light[:, j, i + 1] * a) * (1 - b)
-    values += (light[:, j + 1, i] * (1 - a) + light[:, j + 1, i + 1] * a) * b
-    return np.asarray((values * inside).mean(axis=(2, 3)))
+    a, b = (u - i)[..., np.newaxis], (v - j)[..., np.newaxis]
+    values = (light[j, i] * (1 - a) + light[j, i + 1] * a) * (1 - b)
+    values += (light[j + 1, i] * (1 - a) + light[j + 1, i + 1] * a) * b
+    return np.asarray((values * inside[..., np.newaxis]).mean(axis=(1, 2)))
 
 
 def _numbers(light: Floats, homography: Doubles, border: Border) -> NDArray[np.intp]:
     """The number that each plateau shows, (plateaus,); `LEAD` if there is none, or none that is certain."""
-    read = [read_numbers(_cells(light, homography, cells)) for cells in (border.top, border.bottom)]
+    light = light.transpose(1, 2, 0)
+    read = [read_numbers(_cells(light, homography, cells).T) for cells in (border.top, border.bottom)]
     (above, clear_above), (below, clear_below) = read
     number = np.where(clear_above, above, below)
     ticks = _cells(light, homography, (*border.left, *border.right))
-    odd = ticks[:, ::2].sum(axis=1) > ticks[:, 1::2].sum(axis=1)
+    odd = ticks[::2].sum(axis=0) > ticks[1::2].sum(axis=0)
     certain = (clear_above | clear_below) & ~(clear_above & clear_below & (above != below))
     return np.where(certain & (odd == (number + 1) % 2), number, LEAD)
 

@@ -24,6 +24,7 @@ _LEAST_CLEAN = 0.3  # and the spread is taken for at least so many codes
 # A plateau whose brightness, in codes, runs one way by this share is one whose exposure settles: only its frames within
 # this share of the end are used.
 _DRIFTS, _SETTLED = 0.05, 0.02
+_AT_ONCE = 256  # frames that are compared at a time
 _ONE_WAY = 1.5  # brightness runs one way if its changes add up to no more than so many times the whole change
 
 
@@ -55,7 +56,9 @@ class Recording:
 
     def __init__(self, signatures: NDArray[np.uint8], times: Doubles, hold: float) -> None:
         self.signatures, self.times = signatures, times
-        change = np.array([difference(*signatures[t : t + 2]).max() for t in range(len(times) - 1)])
+        earlier, later = signatures[:-1], signatures[1:]
+        parts = [slice(at, at + _AT_ONCE) for at in range(0, max(len(earlier), 1), _AT_ONCE)]
+        change = np.concatenate([difference(earlier[part], later[part]).max(axis=1) for part in parts])
         self.noise = _quiet(change, times, hold)
         large = _LEAST_SHARE * float(np.quantile(change, _LOUD)) if change.size else 0.0
         limit = np.maximum(_CHANGE * self.noise, max(_LEAST_CHANGE, large))
@@ -87,7 +90,7 @@ class Recording:
         frames = self._settled(frames)
         chosen = np.array(frames)[:: -(-len(frames) // MAX_FRAMES)]
         middle = self.look(chosen)
-        off = np.array([difference(self.signatures[t], middle).max() for t in chosen])
+        off = difference(self.signatures[chosen], middle).max(axis=1)
         spread = max(float(np.median(off)), _LEAST_CLEAN)
         kept = off <= _CLEAN * spread
         return chosen[kept], 1 / (1 + (off[kept] / spread) ** 2)
@@ -107,9 +110,9 @@ class Recording:
 
 
 def difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> Doubles:
-    """Root mean square of the difference of two signatures in each row, (rows,) float64."""
+    """Root mean square of the difference of two signatures, or of pairs of them, in each row, (..., rows) float64."""
     squares = np.subtract(one, other, dtype=np.float64) ** 2
-    return np.asarray(np.sqrt(squares.mean(axis=(1, 2))))
+    return np.asarray(np.sqrt(squares.mean(axis=(-2, -1))))
 
 
 def _quiet(change: Doubles, times: Doubles, hold: float) -> Doubles:
