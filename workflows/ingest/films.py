@@ -1,8 +1,7 @@
 """Read the film of a capture, or a clip, in a decoder."""
 
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
-from itertools import groupby
 from typing import Annotated, Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -77,13 +76,6 @@ class KeepSums(NamedTuple):
     hold: float
     most: int
     put: Callable[[str, memoryview], None]
-
-
-class KeptSums(NamedTuple):
-    """The sums that were kept: their names, and what opens one by its name."""
-
-    names: Container[str]
-    read: Callable[[str], BinaryIO]
 
 
 def scan(
@@ -206,7 +198,6 @@ def means(
     width: int,
     height: int,
     full: float = 1.0,
-    kept: KeptSums | None = None,
 ) -> Iterator[NDArray[np.uint16]]:
     """Weighted means of frames, see `workflows.ingest.video.frame_means.mean_frames`.
 
@@ -216,38 +207,32 @@ def means(
         Size of the frames, upright.
     full : float
         The light of HDR that becomes full scale.
-    kept : KeptSums, optional
-        Sums of frames that need not be decoded again.
 
     Raises
     ------
     CaptureError
         If a frame can't be decoded again.
     """
-    given: dict[str, Any] = {"entry": entry, "memory": decoder.image_bytes, "full": full}
-
-    def is_kept(shares: Sequence[Share]) -> bool:
-        return kept is not None and name_of(shares) in kept.names
-
     with blaming(entry, decoder):
-        for there, group in groupby(plan, is_kept):
-            some = list(group)
-            if kept is None or not there:
-                yield from _pictures(
-                    decoder, decoder.run(_means, file, plan=some, **given), some, (height, width)
-                )
-                continue
-            for shares in some:
-                with kept.read(name_of(shares)) as total:
-                    answers = decoder.run(_mean_of_sum, total, whole=True, full=full)
-                    yield from _pictures(decoder, answers, [shares], (height, width))
+        answers = decoder.run(_means, file, entry=entry, memory=decoder.image_bytes, plan=plan, full=full)
+        yield from _pictures(decoder, answers, len(plan), (height, width))
+
+
+def mean_of_sum(
+    decoder: Decoder, total: BinaryIO, entry: str, width: int, height: int, full: float
+) -> NDArray[np.uint16]:
+    """The mean that `means` would yield, of a sum that `KeepSums` was given."""
+    with blaming(entry, decoder):
+        answers = decoder.run(_mean_of_sum, total, whole=True, full=full)
+        (mean,) = _pictures(decoder, answers, 1, (height, width))
+    return mean
 
 
 def _pictures(
-    decoder: Decoder, answers: Iterator[Any], plan: Sequence[Sequence[Share]], size: tuple[int, int]
+    decoder: Decoder, answers: Iterator[Any], count: int, size: tuple[int, int]
 ) -> Iterator[NDArray[np.uint16]]:
-    """The means that a decoder answers, one for each of a plan."""
-    for _ in plan:
+    """The means that a decoder answers."""
+    for _ in range(count):
         with decoder.checking():
             mean = next(answers, None)
             if not isinstance(mean, np.ndarray) or mean.dtype != np.uint16 or mean.shape != (*size, 3):

@@ -7,7 +7,6 @@ sum.
 
 import hashlib
 import json
-from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import BinaryIO, NamedTuple
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from workflows.ingest.video.clip import Clip, tick_of
 from workflows.ingest.video.frame_means import FrameSum, Look, Share, add_up, shares_of
-from workflows.ingest.video.recording import Recording
+from workflows.ingest.video.recording import NO_CHANGES, Changes, Recording
 
 EVERY = 0.5
 """How often plateaus are looked for, in holds."""
@@ -47,7 +46,8 @@ class PlateauSums:
 
     def __init__(self, clip: Clip, hold: float, memory: int) -> None:
         self._clip, self._hold, self._memory = clip, hold / clip.tick, memory
-        self._seen: deque[_Seen] = deque()
+        self._seen: list[_Seen] = []
+        self._earlier = NO_CHANGES
         self._waiting: dict[int, VideoFrame] = {}
         self._due = -np.inf
 
@@ -61,38 +61,33 @@ class PlateauSums:
         while len(self._waiting) > most or tick - oldest > LONGEST * self._hold:
             del self._waiting[oldest]
             oldest = next(iter(self._waiting), tick)
-        self._forget(oldest)
         if tick >= self._due:
             self._due = tick + EVERY * self._hold
-            yield from self._ended()
+            yield from self._ended(oldest)
 
-    def _ended(self) -> Iterator[tuple[list[Share], FrameSum]]:
-        """The plateaus between events that no later frame makes uncertain."""
+    def _ended(self, begin: int) -> Iterator[tuple[list[Share], FrameSum]]:
+        """The plateaus between events that no later frame makes uncertain, if all frames from ``begin`` on wait."""
         ticks = np.array([seen.tick for seen in self._seen])
         times = (ticks - ticks[0]) * self._clip.tick
-        recording = Recording(
-            np.stack([seen.signature for seen in self._seen]), times, self._hold * self._clip.tick
-        )
+        signatures = np.stack([seen.signature for seen in self._seen])
+        recording = Recording(signatures, times, self._hold * self._clip.tick, self._earlier)
         until = ticks[-1] - AROUND * self._hold
         events = [event for event in recording.events if ticks[event.last] < until]
         for n in range(1, len(events)):
             frames, weights = recording.clean(recording.plateau(n))
             shares = shares_of(ticks[frames], weights)
             if all(share.tick in self._waiting for share in shares):
-                total = add_up(
-                    ((self._waiting[tick], weight) for tick, weight in shares), self._clip.quarter_turns
-                )
-                yield shares, total
+                some = ((self._waiting[tick], weight) for tick, weight in shares)
+                yield shares, add_up(some, self._clip.quarter_turns)
         if events:
             begin = int(ticks[events[-1].last])
-            for tick in [tick for tick in self._waiting if tick < begin]:
-                del self._waiting[tick]
-            self._forget(begin)
-
-    def _forget(self, begin: int) -> None:
-        """Forget the signatures that no plateau from ``begin`` on needs."""
-        while self._seen[0].tick < begin - AROUND * self._hold:
-            self._seen.popleft()
+            self._waiting = {tick: frame for tick, frame in self._waiting.items() if tick >= begin}
+        past = int(np.searchsorted(ticks, begin - AROUND * self._hold))
+        self._seen = self._seen[past:]
+        self._earlier = Changes(
+            np.concatenate([self._earlier.change, recording.change[:past]]),
+            np.concatenate([self._earlier.noise, recording.noise[:past]]),
+        )
 
 
 def name_of(shares: Sequence[Share]) -> str:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from workflows.ingest.camera.border_exposure import BorderValues, strips_of
 from workflows.ingest.camera.calibration import calibrate
 from workflows.ingest.manifest import MANIFEST, Manifest, Video
 from workflows.ingest.pixel_sample import take_sample
+from workflows.ingest.plateau_sums import name_of
 from workflows.ingest.report.survey import survey
 from workflows.ingest.trial.frame_order import check_frames
 from workflows.ingest.trial.qualities import try_qualities
@@ -259,8 +259,8 @@ def work(objects: Objects, task: Task, tile: int) -> int:
     frames = np.empty((last - first, stack.height, stack.width, stack.channels), stack.dtype)
     with uploads.read(objects, task.capture) as file, Decoder(task.limits.image_bytes) as decoder:
         archive = CaptureArchive(file, task.limits)
-        for n, pixels in enumerate(_pixels(objects, task.capture, decoder, archive, stack, first, last)):
-            frames[n] = pixels
+        for n, pixels in _pixels(objects, task.capture, decoder, archive, stack, range(first, last)):
+            frames[n - first] = pixels
     write_slab(objects, task.capture, first, frames)
     return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
 
@@ -317,24 +317,33 @@ def _pixels(
     decoder: Decoder,
     archive: CaptureArchive,
     stack: Stack,
-    first: int,
-    last: int,
-) -> Iterator[integer_formats.Codes]:
-    """The frames of a stack from ``first`` up to ``last``."""
+    frames: range,
+) -> Iterator[tuple[int, integer_formats.Codes]]:
+    """Some frames of a stack, in any order: their numbers and what they show."""
     video = archive.manifest.video
     if video is not None:
         shares = stack.shares()
-        plan = [[Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in range(first, last)]
-        full = stack.attributes["storage"]["full"]
-        kept = films.KeptSums(uploads.sums(objects, capture), partial(uploads.read_sum, objects, capture))
-        with archive.open(video.file) as file:
-            yield from films.means(decoder, file, video.file, plan, stack.width, stack.height, full, kept)
+        plan = {n: [Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in frames}
+        kept = uploads.sums(objects, capture)
+        lacking = {n: some for n, some in plan.items() if name_of(some) not in kept}
+        size = stack.width, stack.height, stack.attributes["storage"]["full"]
+        if lacking:
+            with archive.open(video.file) as file:
+                yield from zip(
+                    lacking,
+                    films.means(decoder, file, video.file, [*lacking.values()], *size),
+                    strict=True,
+                )
+        for n in [n for n in plan if n not in lacking]:
+            with uploads.read_sum(objects, capture, name_of(plan[n])) as total:
+                yield n, films.mean_of_sum(decoder, total, video.file, *size)
         return
     shape = (stack.height, stack.width, stack.channels)
     storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
     kind = np.dtype(np.float32) if storage.black else stack.dtype
     turn = stack.attributes.get("orientation", 1)  # missing from stacks of earlier versions
-    for frame in archive.manifest.frames[first:last]:
+    for n in frames:
+        frame = archive.manifest.frames[n]
         pixels = stills.read(decoder, archive, frame.file, turn, storage.full)
         if pixels.shape != shape or pixels.dtype != kind:
             raise CaptureError(
@@ -343,7 +352,7 @@ def _pixels(
                 "be of one size and kind",
                 entry=frame.file,
             )
-        yield storage.encode(pixels)
+        yield n, storage.encode(pixels)
 
 
 def _size(pixels: NDArray[np.generic]) -> str:

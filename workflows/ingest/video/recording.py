@@ -35,8 +35,24 @@ class Event(NamedTuple):
     last: int
 
 
+class Changes(NamedTuple):
+    """What changes from each frame to the next, and how much of it is noise.
+
+    Attributes
+    ----------
+    change, noise : (n,) float64
+        Root mean square over the row where it is largest, in codes.
+    """
+
+    change: Doubles
+    noise: Doubles
+
+
+NO_CHANGES = Changes(np.zeros(0), np.zeros(0))
+
+
 class Recording:
-    """The events and plateaus of a recording.
+    """The events and plateaus of a recording, or of a part of one.
 
     Parameters
     ----------
@@ -45,24 +61,31 @@ class Recording:
         Seconds, ascending.
     hold : float
         About how long a pattern is shown, in seconds.
+    earlier : Changes, optional
+        Those of the frames before the part. They too tell how large changes and how much noise is usual.
 
     Attributes
     ----------
+    change : (frames - 1,) float64
+        As of `Changes`.
     events : list of Event
         In the order of time; the plateaus lie before, between and after them.
     noise : (frames - 1,) float64
         Change between two frames while nothing changes: root mean square over the noisiest row, in codes.
     """
 
-    def __init__(self, signatures: NDArray[np.uint8], times: Doubles, hold: float) -> None:
+    def __init__(
+        self, signatures: NDArray[np.uint8], times: Doubles, hold: float, earlier: Changes = NO_CHANGES
+    ) -> None:
         self.signatures, self.times = signatures, times
-        earlier, later = signatures[:-1], signatures[1:]
-        parts = [slice(at, at + _AT_ONCE) for at in range(0, max(len(earlier), 1), _AT_ONCE)]
-        change = np.concatenate([difference(earlier[part], later[part]).max(axis=1) for part in parts])
-        self.noise = _quiet(change, times, hold)
-        large = _LEAST_SHARE * float(np.quantile(change, _LOUD)) if change.size else 0.0
+        ones, others = signatures[:-1], signatures[1:]
+        parts = [slice(at, at + _AT_ONCE) for at in range(0, max(len(ones), 1), _AT_ONCE)]
+        self.change = np.concatenate([difference(ones[part], others[part]).max(axis=1) for part in parts])
+        self.noise = _quiet(self.change, times, hold, earlier.noise)
+        every = np.concatenate([earlier.change, self.change])
+        large = _LEAST_SHARE * float(np.quantile(every, _LOUD)) if every.size else 0.0
         limit = np.maximum(_CHANGE * self.noise, max(_LEAST_CHANGE, large))
-        busy = change > limit
+        busy = self.change > limit
         edges = np.flatnonzero(np.diff(np.concatenate([[False], busy, [False]]).astype(np.int8)))
         events = [Event(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
         # A key frame may change the noise everywhere: what looks the same before and after is not an event.
@@ -115,7 +138,7 @@ def difference(one: NDArray[np.generic], other: NDArray[np.generic]) -> Doubles:
     return np.asarray(np.sqrt(squares.mean(axis=(-2, -1))))
 
 
-def _quiet(change: Doubles, times: Doubles, hold: float) -> Doubles:
+def _quiet(change: Doubles, times: Doubles, hold: float, earlier: Doubles) -> Doubles:
     """The noise at each frame: a low quantile of the changes within half a hold before and after.
 
     It is local because a dark picture has other noise than a bright one.
@@ -130,4 +153,5 @@ def _quiet(change: Doubles, times: Doubles, hold: float) -> Doubles:
         at = np.flatnonzero(count == size)
         noise[at] = np.quantile(change[first[at, np.newaxis] + np.arange(size)], _QUIET, axis=1)
     # Where a codec repeats the picture, there is no noise at all for a while.
-    return np.asarray(np.maximum(noise, np.median(noise) / 2 if noise.size else 0))
+    every = np.concatenate([earlier, noise])
+    return np.asarray(np.maximum(noise, np.median(every) / 2 if every.size else 0))
