@@ -10,8 +10,14 @@ from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.resample import LANCZOS_LOBES
 from workflows.ingest.camera.lit import find_lit
-from workflows.ingest.local_gain import local_gain
-from workflows.ingest.measured_light import clipped_from, even_out, look_up_of, odd_frames, unclipped_light
+from workflows.ingest.light.local_gain import local_gain
+from workflows.ingest.light.measured_light import (
+    clipped_from,
+    even_out,
+    look_up_of,
+    odd_frames,
+    unclipped_light,
+)
 from workflows.programs.program import Program
 
 EDGE = 8

@@ -12,8 +12,14 @@ from storage.layout.captures import Stack
 from storage.layout.mattes import Block, Matte, empty_block
 from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve
-from workflows.ingest.local_gain import Surroundings, local_gain
-from workflows.ingest.measured_light import conditions_of, monitor_curve_of, observe, places_in, read_light
+from workflows.ingest.light.local_gain import Surroundings, local_gain
+from workflows.ingest.light.measured_light import (
+    conditions_of,
+    monitor_curve_of,
+    observe,
+    places_in,
+    read_light,
+)
 from workflows.mattes.cut_out import CutOut
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program

@@ -14,7 +14,7 @@ from storage.objects.store import Objects
 from storage.steps import FINISH, PREPARE
 from tests.parts.captures import nested_program
 from workflows.composite import composite
-from workflows.ingest.measured_light import read_light
+from workflows.ingest.light.measured_light import read_light
 from workflows.jobs import Task, run
 from workflows.mattes import preview
 from workflows.mattes.steps import STEPS

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from storage.layout.captures import Stack, Strips
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import light_of_codes
-from workflows.ingest.local_gain import Surroundings
+from workflows.ingest.light.local_gain import Surroundings
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 
@@ -141,7 +141,7 @@ class BorderValues:
         look_up : (k,) or (k, channels) float32
             The light of each code.
         local : Surroundings, optional
-            The local gain of tone mapping, as from `workflows.ingest.local_gain.local_gain`.
+            The local gain of tone mapping, as from `workflows.ingest.light.local_gain.local_gain`.
 
         Notes
         -----

@@ -22,8 +22,8 @@ from workflows.ingest.camera.curve import are_scaled, fit_camera_curve
 from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.camera.sample import FRAMES, FilmedPixels, HalftoneCodes, Sample
 from workflows.ingest.camera.stated_exposure import automatic_exposures
-from workflows.ingest.local_gain import Surroundings, local_gain
-from workflows.ingest.measured_light import clipped_from, exposures_of
+from workflows.ingest.light.local_gain import Surroundings, local_gain
+from workflows.ingest.light.measured_light import clipped_from, exposures_of
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import NoiseModel, estimate_excess
 from workflows.recovery.camera.photometry import estimate_crosstalk, estimate_noise

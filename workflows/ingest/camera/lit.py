@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack, thumbnail_edge, thumbnail_mask
 from workflows.images.tone_curves import Curve, to_light
-from workflows.ingest.measured_light import exposures_of
+from workflows.ingest.light.measured_light import exposures_of
 from workflows.programs.program import Program
 
 SHARE = 0.03

@@ -11,8 +11,8 @@ from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.camera.border_exposure import is_free
 from workflows.ingest.camera.curve import HalfTones, Shown
 from workflows.ingest.camera.lit import windows
-from workflows.ingest.local_gain import Surroundings, local_gain
-from workflows.ingest.measured_light import exposures_of
+from workflows.ingest.light.local_gain import Surroundings, local_gain
+from workflows.ingest.light.measured_light import exposures_of
 from workflows.programs.program import Program
 
 SAMPLES = 20_000

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import from_light, light_of_codes
-from workflows.ingest.measured_light import look_up_of
+from workflows.ingest.light.measured_light import look_up_of
 from workflows.interruption import checkpoint
 from workflows.programs.program import Program
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from workflows.ingest.measured_light import patterns_seen
+from workflows.ingest.light.measured_light import patterns_seen
 from workflows.ingest.report.expected_psnr import expected, left_of, model_error_of
 from workflows.ingest.report.figures import (
     LEVELS,

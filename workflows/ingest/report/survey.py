@@ -14,8 +14,8 @@ from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.camera.border_exposure import BorderValues, is_free, shortest_white
 from workflows.ingest.camera.calibration import calibrate, constant_frames
 from workflows.ingest.camera.lit import find_lit, windows
-from workflows.ingest.local_gain import local_gain
-from workflows.ingest.measured_light import clipped_from, even_out, exposures_of, look_up_of
+from workflows.ingest.light.local_gain import local_gain
+from workflows.ingest.light.measured_light import clipped_from, even_out, exposures_of, look_up_of
 from workflows.ingest.report.colour_detail import ColourDetail
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import NoiseModel

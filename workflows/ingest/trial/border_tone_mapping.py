@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from workflows.ingest.camera.border_exposure import BorderLight, Doubles
-from workflows.ingest.local_gain import DARK, DISPLAY, Surroundings
+from workflows.ingest.light.local_gain import DARK, DISPLAY, Surroundings
 
 SWEEPS = 8
 """Sweeps over what is free in each value, and then in each frame."""

@@ -12,7 +12,7 @@ from storage.layout.captures import Stack, thumbnail_edge, thumbnail_mask
 from workflows.images.resample import area_mean
 from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.camera.border_exposure import BorderValues
-from workflows.ingest.measured_light import exposures_of
+from workflows.ingest.light.measured_light import exposures_of
 from workflows.ingest.video.resemblance import GRIDS, MIN_PATTERNS, coarse_light
 from workflows.programs.parts import Bernoulli
 from workflows.programs.program import Program

@@ -10,7 +10,7 @@ from numba.core.event import install_recorder
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
-from workflows.ingest.measured_light import monitor_curve_of
+from workflows.ingest.light.measured_light import monitor_curve_of
 from workflows.ingest.pixel_sample import PixelSample, see_sample
 from workflows.ingest.trial.trial_recovery import Calibrated, RecoveredSample, recover_seen
 from workflows.programs.parts import Bernoulli

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderValues, is_free
-from workflows.ingest.measured_light import black_patterns
+from workflows.ingest.light.measured_light import black_patterns
 from workflows.ingest.pixel_sample import Doubles, PixelSample
 from workflows.ingest.trial.explanation import explain
 from workflows.ingest.trial.search import Found, Search, are_within, size_of, usual_error
@@ -32,8 +32,8 @@ def find_steadiness(
     ``steadiness`` says what was found. It is None if there are too few pixels to measure, and empty if the patterns
     don't explain what the frames show. Its ``drift`` and ``flicker`` are None if they are too large to be either.
     ``shifts`` (frames, 2), x and y in pixels, and ``gains`` (frames) are None unless they are to be corrected, which
-    `workflows.ingest.measured_light` does. Shifts are relative to the mean position of the patterns, gains to their
-    median, or to a white frame if the exposure was free.
+    `workflows.ingest.light.measured_light` does. Shifts are relative to the mean position of the patterns, gains to
+    their median, or to a white frame if the exposure was free.
 
     Parameters
     ----------

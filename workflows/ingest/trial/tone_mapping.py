@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderLight
-from workflows.ingest.local_gain import DARK, DISPLAY, Surroundings, surroundings
+from workflows.ingest.light.local_gain import DARK, DISPLAY, Surroundings, surroundings
 from workflows.ingest.pixel_sample import Doubles, PixelSample
 from workflows.ingest.trial.border_tone_mapping import Power, border_power
 from workflows.ingest.trial.trial_recovery import HUBER
@@ -60,7 +60,7 @@ def find_tone_mapping(
     -------
     dict or None
         ``power``; ``width`` of the surroundings, as a share of the frame's width; ``usual``, the logarithm of their
-        brightness, plus `workflows.ingest.local_gain.DARK`, that has a gain of 1; and ``spread``, the standard
+        brightness, plus `workflows.ingest.light.local_gain.DARK`, that has a gain of 1; and ``spread``, the standard
         deviation of the logarithm.
 
     Notes

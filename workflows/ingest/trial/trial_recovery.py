@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve, to_light
-from workflows.ingest.measured_light import (
+from workflows.ingest.light.measured_light import (
     conditions_of,
     exposures_of,
     light_of,

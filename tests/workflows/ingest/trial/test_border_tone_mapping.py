@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderLight
-from workflows.ingest.local_gain import DARK, Surroundings, surroundings
+from workflows.ingest.light.local_gain import DARK, Surroundings, surroundings
 from workflows.ingest.trial.border_tone_mapping import border_power
 from workflows.programs.border import border_light
 

@@ -13,7 +13,7 @@ from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
 from workflows.ingest.camera.border_exposure import BorderLight
-from workflows.ingest.local_gain import surroundings
+from workflows.ingest.light.local_gain import surroundings
 from workflows.ingest.pixel_sample import PixelSample
 from workflows.ingest.report.report import report
 from workflows.ingest.trial import tone_mapping

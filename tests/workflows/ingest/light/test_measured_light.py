@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tests.workflows.ingest.video.camera import film
 from tests.workflows.ingest.video.films import CAMERA, IngestFilm
 from workflows.images.tone_curves import table
-from workflows.ingest.measured_light import (
+from workflows.ingest.light.measured_light import (
     clipped_from,
     constants_of,
     merge,

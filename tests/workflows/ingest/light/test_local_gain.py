@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
-from workflows.ingest.local_gain import DARK, Surroundings, local_gain, surroundings
+from workflows.ingest.light.local_gain import DARK, Surroundings, local_gain, surroundings
 
 EDGE = 3
 VALUES = np.random.default_rng(3).random((2, 4, 5)).astype(np.float32)

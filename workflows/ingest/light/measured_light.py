@@ -12,7 +12,7 @@ from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.resample import LANCZOS_LOBES, shift_back
 from workflows.images.tone_curves import CameraCurve, Curve, light_of_codes, table, to_light
-from workflows.ingest.local_gain import Surroundings
+from workflows.ingest.light.local_gain import Surroundings
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 from workflows.recovery.camera.clipped import bound_clipped
@@ -91,7 +91,7 @@ def read_light(
         Rows and columns. If they have a step, frames that drift are shifted by whole pixels only.
     program : Program
     gain : Surroundings or None
-        As from `workflows.ingest.local_gain.local_gain`.
+        As from `workflows.ingest.light.local_gain.local_gain`.
     wanted : (y, x) bool, optional
         Which pixels of the rectangle are wanted of those to be recovered; all by default.
 
