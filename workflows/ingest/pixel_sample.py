@@ -22,6 +22,8 @@ from workflows.programs.program import Program
 
 EDGE = 8
 """Side in pixels of the squares that are examined."""
+BLOCK = 4
+"""Side in pixels of the blocks of neighbours that are taken of larger samples' squares."""
 SQUARES = 40
 """Squares, at most, spread over what is recovered."""
 BYTES = 96 << 20
@@ -85,6 +87,19 @@ class PixelSample(NamedTuple):
             for edge in edges
         ]
         return [(sums[n] - sums[n - 1]) / (8 * n) for n in range(1, len(sums))]
+
+    def blocks(self) -> "PixelSample":
+        """About as many pixels as were chosen, but neighbours: all of the squares, or a block of each."""
+        square, y, x = self.every
+        chosen, most = np.ones(len(square), bool), len(self.chosen[0])
+        if len(square) > most:
+            blocks = (EDGE // BLOCK) ** 2
+            number = blocks * square + EDGE // BLOCK * (y // BLOCK) + x // BLOCK
+            pixels = np.bincount(number, minlength=blocks * len(self.corners)).reshape(-1, blocks)
+            largest = blocks * np.arange(len(pixels)) + pixels.argmax(axis=1)
+            step = max(round(int(pixels.max(axis=1).sum()) / most), 1)
+            chosen = np.isin(number, largest[::step])
+        return self._replace(chosen=tuple(axis[chosen] for axis in self.every))
 
     def thinned(self, most: int) -> "PixelSample":
         """The same squares with at most so many of the chosen pixels, spread over all of them."""

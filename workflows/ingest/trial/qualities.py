@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.ingest.light.measured_light import monitor_curve_of
-from workflows.ingest.pixel_sample import PixelSample, see_sample
+from workflows.ingest.pixel_sample import PixelSample, Seen, see_sample
 from workflows.ingest.trial.trial_recovery import Calibrated, RecoveredSample, recover_seen
 from workflows.programs.parts import Bernoulli
 from workflows.programs.program import Program
@@ -21,10 +21,10 @@ from workflows.recovery.lobes.options import FAST, FINE
 from workflows.recovery.sensing import Patterns
 
 QUALITIES = {"fine": FINE, "fast": FAST}
-MOST_HELD_OUT = 10
-"""Patterns that are predicted, about: their contrast takes time too."""
-PIXELS = 320
-"""Pixels, at most, that are recovered without them."""
+MOST_PREDICTED = 20
+"""Patterns that are predicted, at most: their contrast takes time too."""
+MOST_LEVERAGE = 0.9
+"""Of a pattern: its errors are made at most ten times as large."""
 COLOURED = 0.7
 """How much narrower the intervals of JPEG and HEIC stills are if the patterns are in colour: these are stored at half
 the resolution, so that what is held out is farther from the truth than T, which is found from many of them."""
@@ -46,6 +46,21 @@ class QualityTrial(NamedTuple):
 
     seconds: float
     interval: Interval | None
+
+
+class _Prediction(NamedTuple):
+    """What a recovery predicts of k patterns.
+
+    Attributes
+    ----------
+    light : (n, k, 3) float32
+        As the pixels see it.
+    contrast : (n, k, 3) float32
+        That of the pattern as it arrives, times rho squared.
+    """
+
+    light: NDArray[np.float32]
+    contrast: NDArray[np.float32]
 
 
 def try_qualities(stack: Stack, sample: PixelSample, patterns: Patterns) -> dict[str, QualityTrial] | None:
@@ -77,31 +92,20 @@ def try_qualities(stack: Stack, sample: PixelSample, patterns: Patterns) -> dict
         gains = np.log(attributes["gains"])
     tried = sample.some_squares()
     seen, places = see_sample(stack, tried, shifts), tried.places.T
-    # For an interval, pixels from all over the glass count for more than the neighbours that a recovery starts from.
-    spread = see_sample(stack, sample.thinned(PIXELS), shifts)
     share = sample.wanted / len(places)
-    random = [part for part in program.parts if isinstance(part, Bernoulli)]
-    # Each of a few stripes tells what no other does: without it, predictions would be far worse than with it.
-    step = max(HELD_OUT if random else 1, patterns.count // MOST_HELD_OUT)
-    chosen = np.arange(step // 2, patterns.count, step)
-    held_out = chosen if random else ()
-    # On fixed grids, no pattern tells where in a block the light comes from, but backdrops do.
-    can_tell = not random or any(part.offset for part in random)
     seconds: dict[str, float] = {}
-    without: dict[str, RecoveredSample] = {}
     for name, options in QUALITIES.items():
         taken = _seconds(partial(recover_seen, capture, patterns, seen, gains, options, places))
         if taken is None:
             return None
         seconds[name] = round(share * taken, 2)
-        if can_tell:
-            found = recover_seen(capture, patterns, spread, gains, options, held_out=held_out)
-            without |= {name: found} if found else {}
-    predictions = _predict(patterns, list(without.values()), chosen) if without else []
-    intervals = {
-        name: _interval(capture, found, *prediction, chosen)
-        for (name, found), prediction in zip(without.items(), predictions, strict=True)
-    }
+    random = [part for part in program.parts if isinstance(part, Bernoulli)]
+    # On fixed grids, no pattern tells where in a block the light comes from, but backdrops do.
+    can_tell = not random or any(part.offset for part in random)
+    intervals: dict[str, Interval | None] = {}
+    if can_tell:
+        spread = sample.blocks()
+        intervals = _intervals(capture, patterns, spread, see_sample(stack, spread, shifts), gains)
     return {name: QualityTrial(taken, intervals.get(name)) for name, taken in seconds.items()}
 
 
@@ -116,30 +120,94 @@ def _seconds(recover: Callable[[], RecoveredSample | None]) -> float | None:
     return _seconds(recover) if compiled.buffer else taken
 
 
+def _intervals(
+    capture: Calibrated, patterns: Patterns, sample: PixelSample, seen: Seen, gains: NDArray[np.float64]
+) -> dict[str, Interval | None]:
+    """The interval of each quality, from what recoveries of a sample predict of patterns that they have not seen.
+
+    Some random patterns are held out of each square. Each of a few stripes tells what no other does: without it,
+    predictions would be far worse than with it. So where there are no random patterns, all are used, and the recovery
+    is repeated with a disturbance of each. The share of it that returns in the prediction is the pattern's leverage:
+    without the pattern, the error would be 1 / (1 - leverage) times as large, exactly so of a linear fit.
+    """
+    chosen = _random_patterns(capture.program)
+    is_held_out = len(chosen) > 0
+    chosen = chosen if is_held_out else np.arange(patterns.count)
+    step = -(-len(chosen) // MOST_PREDICTED)
+    chosen = chosen[step // 2 :: step]
+    square, places = np.unique(sample.chosen[0], return_inverse=True)[1], sample.places.T
+    tested = np.ones((len(square), len(chosen)), bool)
+    held_out = None
+    if is_held_out:
+        groups = -(-len(chosen) * HELD_OUT // patterns.count)
+        tested = square[:, np.newaxis] % groups == np.arange(len(chosen)) % groups
+        held_out = np.zeros((len(square), patterns.count), bool)
+        held_out[:, chosen] = tested
+    tries = [seen] if is_held_out else [seen, _disturbed(capture.stack, seen, square)]
+    recovered: dict[str, list[RecoveredSample]] = {}
+    for name, options in QUALITIES.items():
+        tried = [
+            recover_seen(capture, patterns, each, gains, options, places, square, held_out) for each in tries
+        ]
+        recovered[name] = [each for each in tried if each is not None]
+    predictions = iter(_predict(patterns, [each for made in recovered.values() for each in made], chosen))
+    intervals: dict[str, Interval | None] = {}
+    for name, made in recovered.items():
+        predicted = [next(predictions) for _ in made]
+        if len(made) < len(tries):
+            continue
+        shown = capture.program.measured[chosen]
+        error = made[0].light.values[:, shown] - predicted[0].light
+        if not is_held_out:
+            disturbance = made[1].light.values[:, shown] - made[0].light.values[:, shown]
+            usable = made[0].light.usable[:, shown] & made[1].light.usable[:, shown]
+            returned = disturbance * (predicted[1].light - predicted[0].light)
+            leverage = returned.sum(axis=(0, 2), where=usable)
+            leverage /= np.maximum((disturbance**2).sum(axis=(0, 2), where=usable), 1e-12)
+            error /= 1 - np.clip(leverage, 0, MOST_LEVERAGE)[:, np.newaxis]
+        intervals[name] = _interval(capture, made[0], error, predicted[0], tested, chosen)
+    return intervals
+
+
+def _random_patterns(program: Program) -> NDArray[np.intp]:
+    """The random patterns, as numbers among those measured."""
+    are_random = [isinstance(part, Bernoulli) for part in program.parts for _ in range(part.count)]
+    found: NDArray[np.intp] = np.flatnonzero(np.array(are_random)[program.measured])
+    return found
+
+
+def _disturbed(stack: Stack, seen: Seen, square: NDArray[np.intp]) -> Seen:
+    """What is seen, with frames that are too bright or too dark by their noise, the same for all of a square."""
+    frames, squares = len(seen.values), int(square.max()) + 1
+    bits = np.random.PCG64(0).random_raw(frames * squares).reshape(frames, squares) & 1
+    sign = (2 * bits.astype(np.float32) - 1)[:, square, np.newaxis]
+    noise = NoiseModel(**stack.attributes["noise"])
+    deviation = np.sqrt(noise.variance(seen.values)).astype(np.float32)
+    return seen._replace(values=seen.values + sign * deviation)
+
+
 def _interval(
     capture: Calibrated,
     found: RecoveredSample,
-    predicted: NDArray[np.float32],
-    contrast: NDArray[np.float32],
+    error: NDArray[np.float32],
+    predicted: _Prediction,
+    tested: NDArray[np.bool_],
     chosen: NDArray[np.intp],
 ) -> Interval | None:
-    """The interval by what a recovery predicts of some patterns; None if too little of these was seen."""
+    """The interval by the errors of what a recovery predicts of some patterns; None if too little was seen of these."""
     stack, program, _ = capture
     attributes, channels, photometry = stack.attributes, stack.channels, found.photometry
     noise, model_error = NoiseModel(**attributes["noise"]), float(attributes["model_error"])
     shown = program.measured[chosen]
-    light, worth = found.light.values[:, shown], found.light.worth[:, shown]
-    if found.stray is not None:
-        predicted = predicted + found.stray[:, chosen]
-    variance = noise.variance(predicted) / np.maximum(worth, 1e-6)
+    variance = noise.variance(predicted.light) / np.maximum(found.light.worth[:, shown], 1e-6)
     variance += (model_error * photometry.rho[:, np.newaxis]) ** 2
-    known = found.light.usable[:, shown] & found.alive[:, np.newaxis]
+    known = found.light.usable[:, shown] & found.alive[:, np.newaxis] & tested[:, :, np.newaxis]
     known[:, :, channels:] = False
     if not known.any():
         return None
     fitted = fit_interval(
-        (light - predicted)[known],
-        contrast[known],
+        error[known],
+        predicted.contrast[known],
         variance[known],
         float(np.median(photometry.rho[found.alive])),
         noise,
@@ -152,26 +220,25 @@ def _interval(
 
 
 def _predict(
-    patterns: Patterns, found: list[RecoveredSample], chosen: NDArray[np.intp]
-) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Some patterns as the pixels see them, and rho squared times their contrast as it arrives, (n, k, 3) each.
-
-    The contrast of a pattern is worked out once for all recoveries.
-    """
+    patterns: Patterns, recovered: list[RecoveredSample], chosen: NDArray[np.intp]
+) -> list[_Prediction]:
+    """Predict some patterns by each recovery. The contrast of a pattern is worked out once for all of them."""
     pyramid = patterns.pyramid
     columns, rows = pyramid.grids[0]
     code = patterns.code.reshape(len(patterns.code), patterns.channels, patterns.count)
     made = []
-    for sample in found:
+    for sample in recovered:
         shape = len(sample.photometry.rho), len(chosen), 3
-        made.append((np.empty(shape, np.float32), np.empty(shape, np.float32)))
+        made.append(_Prediction(np.empty(shape, np.float32), np.empty(shape, np.float32)))
     for n, pattern in enumerate(chosen):
         light = code[:, :, pattern].astype(np.float32) / np.float32(255)
         square = pyramid.light((light[: columns * rows] ** 2).reshape(rows, columns, -1))
         around = local_contrast(pyramid, light, square)
         light, around = (np.broadcast_to(part, (len(code), 3)) for part in (light, around))
-        for sample, (predicted, contrast) in zip(found, made, strict=True):
+        for sample, predicted in zip(recovered, made, strict=True):
             S, rho = sample.photometry.S, sample.photometry.rho
-            predicted[:, n] = S + rho * sample.transport.apply(light)
-            contrast[:, n] = rho**2 * sample.transport.apply(around)
+            predicted.light[:, n] = S + rho * sample.transport.apply(light)
+            if sample.stray is not None:
+                predicted.light[:, n] += sample.stray[:, pattern]
+            predicted.contrast[:, n] = rho**2 * sample.transport.apply(around)
     return made

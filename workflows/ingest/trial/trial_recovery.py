@@ -1,6 +1,5 @@
 """Recover some pixels of a capture, and measure how each frame differs from what the recovery predicts."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -113,7 +112,8 @@ def recover_seen(
     gains: Doubles,
     options: LobesOptions = FINE,
     places: NDArray[np.intp] | None = None,
-    held_out: Sequence[int] | NDArray[np.intp] = (),
+    squares: NDArray[np.intp] | None = None,
+    held_out: NDArray[np.bool_] | None = None,
 ) -> RecoveredSample | None:
     """Recover what is seen of a sample; None if it has too little contrast.
 
@@ -123,8 +123,10 @@ def recover_seen(
         Logarithms of the gains of the frames.
     places : (n, 2) int, optional
         Rows and columns of the pixels, to start from neighbours as in a matte. Default: each pixel is fitted alone.
-    held_out : sequence of int, optional
-        Patterns, as numbers among those measured, that are not used.
+    squares : (n,) int, optional
+        The squares of these pixels, ascending: threads then recover some of them each. Default: one recovers all.
+    held_out : (n, m) bool, optional
+        Which of the patterns that are measured are not used of each pixel.
     """
     stack, program, monitor = capture
     attributes = stack.attributes | {"gains": np.exp(gains).tolist() if gains.any() else None}
@@ -135,18 +137,23 @@ def recover_seen(
     if np.count_nonzero(alive.any(axis=1)) < MIN_PIXELS:
         return None
     conditions = conditions_of(stack, program)
-    light.usable[:, held_out] = False
+    if held_out is not None:
+        light.usable[held_out] = False
     n = len(light.values)
-    firsts = range(0, n, n if places is not None else ALONE)
+    firsts = np.arange(0, n, n if places is not None else ALONE)
+    if squares is not None:
+        begin = np.flatnonzero(np.diff(squares, prepend=-1))
+        firsts = begin[np.unique(begin // ALONE, return_index=True)[1]]
     parts: dict[int, Recovery] = {}
 
-    def recover_part(first: int) -> None:
-        at = slice(first, first + firsts.step)
+    def recover_part(number: int) -> None:
+        at = slice(firsts[number], firsts[number + 1] if number + 1 < len(firsts) else n)
+        near = None if places is None else places[at]
         part = light.of_pixels(at), photometry.of_pixels(at)
-        parts[first] = recover(*part, patterns, noise, options, conditions, places)
+        parts[number] = recover(*part, patterns, noise, options, conditions, near)
 
-    in_parts(recover_part, firsts, CORES)
-    made = _joined([parts[first] for first in firsts])
+    in_parts(recover_part, range(len(firsts)), CORES)
+    made = _joined([parts[number] for number in range(len(firsts))])
     assert conditions.strays is not None
     return RecoveredSample(found, made.photometry, made.transport, conditions.strays, made.stray, alive, seen)
 

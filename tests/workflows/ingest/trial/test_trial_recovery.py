@@ -8,7 +8,7 @@ import pytest
 
 from storage.layout.captures import Stack
 from tests.parts.captures import nested_program
-from workflows.ingest.pixel_sample import EDGE, MARGIN, PixelSample, take_sample
+from workflows.ingest.pixel_sample import BLOCK, EDGE, MARGIN, PixelSample, take_sample
 from workflows.ingest.trial import trial_recovery
 from workflows.ingest.trial.trial_recovery import ALONE, Calibrated, recover_sample
 from workflows.programs.pyramid_light import lay_out
@@ -56,3 +56,24 @@ def test_rings_are_the_means_of_the_pixels_around_each() -> None:
         )
         assert first[1, n] == pytest.approx((near.sum() - near[1, 1]) / 8)
         assert second[1, n] == pytest.approx((wide.sum() - near.sum()) / 16)
+
+
+def test_blocks_are_neighbours_from_all_squares() -> None:
+    corners = np.zeros((3, 2), np.intp)
+    inside = np.ones((3, EDGE, EDGE), bool)
+    inside[1, :, :-BLOCK] = False  # the square's left half sees nothing
+    every = np.nonzero(inside)
+
+    def blocks(most: int) -> list[list[tuple[int, int]]]:
+        chosen = tuple(axis[:most] for axis in every)
+        square, y, x = PixelSample(np.empty(0, np.uint8), chosen, every, 0, corners).blocks().chosen
+        return [list(zip(y[square == n].tolist(), x[square == n].tolist(), strict=True)) for n in range(3)]
+
+    found = blocks(3 * BLOCK**2)
+    assert [len(pixels) for pixels in found] == [BLOCK**2] * 3
+    for pixels in found:
+        y, x = np.array(pixels).T
+        assert np.ptp(y) == np.ptp(x) == BLOCK - 1
+    assert min(x for _, x in found[1]) == EDGE - BLOCK
+    assert [len(pixels) for pixels in blocks(BLOCK**2)] == [BLOCK**2, 0, 0]  # no more than memory allows
+    assert sum(map(len, blocks(len(every[0])))) == len(every[0])
