@@ -1,7 +1,7 @@
 """What a recovery of each quality takes, and how far it will be from the truth, by trials on some pixels."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -23,6 +23,8 @@ from workflows.recovery.sensing import Patterns
 QUALITIES = {"fine": FINE, "fast": FAST}
 MOST_PREDICTED = 20
 """Patterns that are predicted, at most: their contrast takes time too."""
+PIXELS = 320
+"""Pixels, at most, from which patterns are held out."""
 MOST_LEVERAGE = 0.9
 """Of a pattern: its errors are made at most ten times as large."""
 COLOURED = 0.7
@@ -104,7 +106,8 @@ def try_qualities(stack: Stack, sample: PixelSample, patterns: Patterns) -> dict
     can_tell = not random or any(part.offset for part in random)
     intervals: dict[str, Interval | None] = {}
     if can_tell:
-        spread = sample.blocks()
+        # The leverage of stripes is a mean over pixels, and fewer tell too little of it.
+        spread = (sample.thinned(PIXELS) if random else sample).blocks()
         intervals = _intervals(capture, patterns, spread, see_sample(stack, spread, shifts), gains)
     return {name: QualityTrial(taken, intervals.get(name)) for name, taken in seconds.items()}
 
@@ -159,14 +162,23 @@ def _intervals(
         shown = capture.program.measured[chosen]
         error = made[0].light.values[:, shown] - predicted[0].light
         if not is_held_out:
-            disturbance = made[1].light.values[:, shown] - made[0].light.values[:, shown]
-            usable = made[0].light.usable[:, shown] & made[1].light.usable[:, shown]
-            returned = disturbance * (predicted[1].light - predicted[0].light)
-            leverage = returned.sum(axis=(0, 2), where=usable)
-            leverage /= np.maximum((disturbance**2).sum(axis=(0, 2), where=usable), 1e-12)
-            error /= 1 - np.clip(leverage, 0, MOST_LEVERAGE)[:, np.newaxis]
+            leverage = np.clip(_leverage(made, predicted, shown), 0, MOST_LEVERAGE)
+            error /= 1 - leverage[:, np.newaxis]
         intervals[name] = _interval(capture, made[0], error, predicted[0], tested, chosen)
     return intervals
+
+
+def _leverage(
+    made: Sequence[RecoveredSample], predicted: Sequence[_Prediction], shown: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    """The share of the disturbance of each pattern that returns in the prediction, (k,), in the mean of all pixels."""
+    (plain, disturbed), (before, after) = made, predicted
+    disturbance = disturbed.light.values[:, shown] - plain.light.values[:, shown]
+    usable = plain.light.usable[:, shown] & disturbed.light.usable[:, shown]
+    returned = (disturbance * (after.light - before.light)).sum(axis=(0, 2), where=usable)
+    whole = (disturbance**2).sum(axis=(0, 2), where=usable)
+    leverage: NDArray[np.float32] = returned / np.maximum(whole, 1e-12)
+    return leverage
 
 
 def _random_patterns(program: Program) -> NDArray[np.intp]:
