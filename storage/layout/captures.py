@@ -9,6 +9,7 @@ measurements. The uploaded archive stays where `storage.layout.uploads` has it u
 """
 
 from collections.abc import Coroutine, Sequence
+from functools import cached_property
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -269,8 +270,13 @@ class Stack:
         """Like `read_some`, for the rows of the strips that `create_stack` was given, and some of their columns, but
         from few chunks; None if it was given none, or by an earlier version.
         """
+        return None if self._strips is None else np.asarray(self._strips[:, :, columns])
+
+    @cached_property
+    def _strips(self) -> zarr.Array[Any] | None:
+        found: zarr.Array[Any] | None
         (found,) = gather(_optional(self._objects.array(f"{self._path}/strips")))
-        return None if found is None else np.asarray(found[:, :, columns])
+        return found
 
     def read_masked(
         self, rows: slice = slice(None), columns: slice = slice(None)
