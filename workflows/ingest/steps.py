@@ -259,7 +259,13 @@ def work(objects: Objects, task: Task, tile: int) -> int:
     frames = np.empty((last - first, stack.height, stack.width, stack.channels), stack.dtype)
     with uploads.read(objects, task.capture) as file, Decoder(task.limits.image_bytes) as decoder:
         archive = CaptureArchive(file, task.limits)
-        for n, pixels in _pixels(objects, task.capture, decoder, archive, stack, range(first, last)):
+        video, numbers = archive.manifest.video, range(first, last)
+        read = (
+            _still_frames(decoder, archive, stack, numbers)
+            if video is None
+            else _film_frames(objects, task.capture, decoder, archive, video.file, stack, numbers)
+        )
+        for n, pixels in read:
             frames[n - first] = pixels
     write_slab(objects, task.capture, first, frames)
     return int(frames.shape[0] * frames.shape[1] * frames.shape[2])
@@ -311,38 +317,15 @@ def _try_out(stack: Stack, border: BorderValues | None) -> dict[str, float] | No
 STEPS = Steps("ingest", "reading", prepare, work, missing, finish, scattered=False)
 
 
-def _pixels(
-    objects: Objects,
-    capture: str,
-    decoder: Decoder,
-    archive: CaptureArchive,
-    stack: Stack,
-    frames: range,
+def _still_frames(
+    decoder: Decoder, archive: CaptureArchive, stack: Stack, numbers: range
 ) -> Iterator[tuple[int, integer_formats.Codes]]:
-    """Some frames of a stack, in any order: their numbers and what they show."""
-    video = archive.manifest.video
-    if video is not None:
-        shares = stack.shares()
-        plan = {n: [Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()] for n in frames}
-        kept = uploads.sums(objects, capture)
-        lacking = {n: some for n, some in plan.items() if name_of(some) not in kept}
-        size = stack.width, stack.height, stack.attributes["storage"]["full"]
-        if lacking:
-            with archive.open(video.file) as file:
-                yield from zip(
-                    lacking,
-                    films.means(decoder, file, video.file, [*lacking.values()], *size),
-                    strict=True,
-                )
-        for n in [n for n in plan if n not in lacking]:
-            with uploads.read_sum(objects, capture, name_of(plan[n])) as total:
-                yield n, films.mean_of_sum(decoder, total, video.file, *size)
-        return
+    """Some frames of a stack of stills: their numbers and what they show."""
     shape = (stack.height, stack.width, stack.channels)
     storage = stills.Storage(stack.dtype, **stack.attributes["storage"])
     kind = np.dtype(np.float32) if storage.black else stack.dtype
     turn = stack.attributes.get("orientation", 1)  # missing from stacks of earlier versions
-    for n in frames:
+    for n in numbers:
         frame = archive.manifest.frames[n]
         pixels = stills.read(decoder, archive, frame.file, turn, storage.full)
         if pixels.shape != shape or pixels.dtype != kind:
@@ -353,6 +336,37 @@ def _pixels(
                 entry=frame.file,
             )
         yield n, storage.encode(pixels)
+
+
+def _film_frames(
+    objects: Objects,
+    capture: str,
+    decoder: Decoder,
+    archive: CaptureArchive,
+    entry: str,
+    stack: Stack,
+    numbers: range,
+) -> Iterator[tuple[int, integer_formats.Codes]]:
+    """Some frames of a film's stack, in any order: their numbers and what they show."""
+    shares, kept = stack.shares(), uploads.sums(objects, capture)
+    size = stack.width, stack.height, stack.attributes["storage"]["full"]
+    summed: dict[int, str] = {}
+    lacking: dict[int, list[Share]] = {}
+    for n in numbers:
+        plan = [Share(*row) for row in shares[shares[:, 0] == n, 1:].tolist()]
+        name = name_of(plan)
+        if name in kept:
+            summed[n] = name
+        else:
+            lacking[n] = plan
+    if lacking:
+        with archive.open(entry) as file:
+            yield from zip(
+                lacking, films.means(decoder, file, entry, [*lacking.values()], *size), strict=True
+            )
+    for n, name in summed.items():
+        with uploads.read_sum(objects, capture, name) as total:
+            yield n, films.mean_of_sum(decoder, total, entry, *size)
 
 
 def _size(pixels: NDArray[np.generic]) -> str:
