@@ -38,7 +38,7 @@ class Session:
     Parameters
     ----------
     url : str
-        Of the service.
+        Of the service, or of its API, which ends in ``/v1``.
     key : str, optional
         API key.
 
@@ -60,7 +60,7 @@ class Session:
             raise InvalidKey
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         try:
-            base = httpx2.URL(url)
+            base = httpx2.URL(url.rstrip("/").removesuffix("/v1"))
         except httpx2.InvalidURL:
             base = httpx2.URL("")
         if base.scheme not in ("http", "https") or not base.host:

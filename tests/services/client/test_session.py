@@ -230,6 +230,14 @@ def test_proxy_that_is_no_http_proxy_is_named(monkeypatch: pytest.MonkeyPatch, p
         Client("https://glass.example")
 
 
+@pytest.mark.parametrize("path", ["", "/", "/v1", "/v1/"])
+def test_url_of_the_service_or_of_its_api_is_given(path: str) -> None:
+    answer = 200, {}, json.dumps(JOB).encode()
+    with scripted_server(lambda n: answer) as (url, calls), Client(url + path) as client:
+        client.job("j")
+    assert calls[0]["call"] == "GET /v1/jobs/j"
+
+
 @pytest.mark.parametrize("url", ["localhost:8000", "ftp://x", "http://", ""])
 def test_invalid_url_is_refused(url: str) -> None:
     with pytest.raises(ValueError, match="http://HOST:PORT"):
