@@ -1,10 +1,11 @@
 """Shares of owners, and work that ends with its client, at its deadline and with the service, on a real port."""
 
 import asyncio
+import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
 import httpx2
@@ -27,21 +28,21 @@ SECONDS = 2.0
 class Works:
     """An API whose only route works until it is ended."""
 
-    url: str = ""
+    port: int = 0
     server: uvicorn.Server = field(init=False)
     thread: threading.Thread = field(init=False)
     working: set[str] = field(default_factory=set)
 
-    def start(self, owner: str, timeout: float) -> threading.Thread:
-        """Ask for work, for a time, in a thread of its own."""
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
 
-        def ask() -> None:
-            with suppress(httpx2.HTTPError):
-                httpx2.get(f"{self.url}/{owner}", timeout=timeout)
-
-        asking = threading.Thread(target=ask)
-        asking.start()
-        return asking
+    @contextmanager
+    def asked(self, owner: str) -> Iterator[None]:
+        """Ask for work whose deadline does not come, and hang up when the block ends."""
+        with socket.create_connection(("127.0.0.1", self.port)) as connection:
+            connection.sendall(f"GET /{owner}?seconds=600 HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+            yield
 
 
 @pytest.fixture
@@ -65,7 +66,8 @@ def works() -> Iterator[Works]:
 
     config = uvicorn.Config(app, port=0, log_config=None, lifespan="off", timeout_graceful_shutdown=1)
     with config.bind_socket() as bound:
-        made.url = f"http://127.0.0.1:{bound.getsockname()[1]}"
+        bound.listen()  # the server does so only when it has started
+        made.port = bound.getsockname()[1]
         made.server = uvicorn.Server(config)
         made.thread = threading.Thread(target=made.server.run, kwargs={"sockets": [bound]})
         made.thread.start()
@@ -75,13 +77,13 @@ def works() -> Iterator[Works]:
 
 
 def test_work_ends_with_its_client_and_leaves_room_for_the_next(works: Works) -> None:
-    asking = [works.start("alice", 1.5) for _ in range(5)]
-    until(lambda: "alice" in works.working)
-    bob = works.start("bob", 0.5)  # alice cannot have both slots
-    until(lambda: works.working == {"alice", "bob"})
-    for one in (*asking, bob):
-        one.join()
-    until(lambda: not works.working, SECONDS / 2)
+    with ExitStack() as stack:
+        for _ in range(5):
+            stack.enter_context(works.asked("alice"))
+        until(lambda: "alice" in works.working)
+        stack.enter_context(works.asked("bob"))  # alice cannot have both slots
+        until(lambda: works.working == {"alice", "bob"})
+    until(lambda: not works.working)
 
 
 def test_work_of_a_client_that_has_gone_does_not_begin() -> None:
@@ -105,13 +107,12 @@ def test_work_ends_at_its_deadline_with_a_remedy(works: Works) -> None:
 
 
 def test_work_ends_with_the_server(works: Works) -> None:
-    asking = works.start("alice", 60)
-    until(lambda: works.working)
-    works.server.should_exit = True
-    works.thread.join(10)
-    assert not works.thread.is_alive()
-    until(lambda: not works.working, 1)
-    asking.join()
+    with works.asked("alice"):
+        until(lambda: works.working)
+        works.server.should_exit = True
+        works.thread.join(120)
+        assert not works.thread.is_alive()
+        until(lambda: not works.working)
 
 
 def test_owners_take_turns_and_small_amounts_do_not_pass_large_ones() -> None:
@@ -154,11 +155,10 @@ def test_two_owners_with_many_requests_keep_a_third_waiting_for_one_turn() -> No
 
 
 def test_turn_that_does_not_come_is_refused_with_when_to_try_again(works: Works) -> None:
-    asking = works.start("alice?seconds=60", 2)
-    until(lambda: "alice" in works.working)
-    answer = httpx2.get(f"{works.url}/alice?seconds=0.1", timeout=60)
+    with works.asked("alice"):
+        until(lambda: "alice" in works.working)
+        answer = httpx2.get(f"{works.url}/alice?seconds=0.1", timeout=60)
     assert (answer.status_code, int(answer.headers["retry-after"]) > 0) == (429, True)
-    asking.join()
 
 
 def test_more_than_an_owner_may_have_is_refused_by_the_setting() -> None:

@@ -24,7 +24,7 @@ from storage.objects import marker
 from storage.objects.store import Objects
 
 UNEXPECTED = """
-import threading, httpx2, uvicorn
+import threading, time, httpx2, uvicorn
 from fastapi import FastAPI
 from services.api.http.errors import register
 from services.runtime.logs import configure_logging
@@ -41,7 +41,7 @@ server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, log_level="
 thread = threading.Thread(target=server.run)
 thread.start()
 while not server.started:
-    pass
+    time.sleep(0.01)
 port = server.servers[0].sockets[0].getsockname()[1]
 assert httpx2.get(f"http://127.0.0.1:{port}/").status_code == 500
 server.should_exit = True

@@ -69,6 +69,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     config = uvicorn.Config(app, port=0, http=Connection, log_config=None, lifespan="off")
     with pytest.MonkeyPatch.context() as patch, config.bind_socket() as bound:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        bound.listen()  # the server does so only when it has started
         patch.setattr(slow_clients, "CHECK_SECONDS", CHECK_SECONDS)
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})
