@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.codecs import ZstdCodec
+from zarr.codecs import TransposeCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from storage.errors import Corrupt
@@ -30,6 +30,11 @@ MEASURED = "measured"
 FRAME_CODECS = (ZstdCodec(level=1, checksum=False), *CODECS[1:])
 """Codecs of the frames' chunks. Level 3 takes twice as long; by it, means of a film's frames get larger, stills smaller
 by 5 %."""
+GRID = ("shape", "chunk_grid", "codecs")
+"""The metadata of an array that its chunks depend on."""
+FRAMES_LAST = TransposeCodec(order=(1, 2, 3, 0))
+"""How the values of a film's frames lie in a chunk: those of a pixel side by side. They are packed and unpacked in 0.7
+of the time, and get smaller by 12 %. Stills, which are noisier, would not."""
 CHUNK = 1 << 20
 """Approximate bytes of a chunk of the stack: small enough that a tile reads little more than its own pixels."""
 THUMBNAIL = 80
@@ -71,7 +76,8 @@ def create_stack(
 ) -> int:
     """Create the empty stack of a capture; a repeated call writes the same and leaves frames written since as they are.
 
-    If its grid of chunks is another than before, as with another memory, the frames written before are deleted.
+    If its chunks are others than before, as with another memory, or packed otherwise, as by an earlier version, the
+    frames written before are deleted.
 
     Parameters
     ----------
@@ -113,6 +119,7 @@ def create_stack(
         shape=shape,
         dtype=dtype,
         chunks=(slab, min(edge, height), min(edge, width), channels),
+        filters=() if shares is None else FRAMES_LAST,
         compressors=FRAME_CODECS,
         dimension_names=("frame", "y", "x", "channel"),
     )
@@ -143,7 +150,7 @@ def create_stack(
         group.create_array("shares", data=shares, dimension_names=("share", "column"), **whole)
     for n, image in enumerate(images):
         group.create_array(f"images/{n}", data=image, dimension_names=("row", "column", "channel"), **whole)
-    if _is_other_grid(objects, capture, stack):
+    if _has_other_chunks(objects, capture, stack):
         # Some chunks would lie beyond the new grid, and others hide that a new one was lost. The metadata stays until
         # it is replaced, so if this is interrupted, the next call deletes the rest.
         for name in ("frames", "thumbnails", "strips"):
@@ -152,13 +159,13 @@ def create_stack(
     return slab
 
 
-def _is_other_grid(objects: Objects, capture: str, stack: zarr.Array[Any]) -> bool:
-    """Whether the stack that a capture has in the store has another shape or other chunks."""
+def _has_other_chunks(objects: Objects, capture: str, stack: zarr.Array[Any]) -> bool:
+    """Whether the stack that a capture has in the store has another shape, or other chunks or codecs."""
     try:
         (before,) = gather(objects.array(f"{path(capture)}/frames"))
     except (FileNotFoundError, Corrupt):  # what is damaged is written again
         return False
-    return bool((before.shape, before.chunks) != (stack.shape, stack.chunks))
+    return any(getattr(before.metadata, name) != getattr(stack.metadata, name) for name in GRID)
 
 
 def write_slab(objects: Objects, capture: str, first: int, frames: NDArray[np.unsignedinteger]) -> None:
@@ -255,6 +262,8 @@ class Stack:
 
     def read_frames(self, frames: list[int], rows: slice, columns: slice) -> NDArray[Any]:
         """Like `read`, for any frames in any order."""
+        if frames == list(range(frames[0], frames[-1] + 1)):  # takes half the time
+            return self.read(rows, columns, slice(frames[0], frames[-1] + 1))
         return np.asarray(self._frames.oindex[np.array(frames), rows, columns])
 
     def read_some(

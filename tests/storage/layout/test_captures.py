@@ -54,6 +54,8 @@ def test_written_frames_are_read_back(objects: Objects, values: NDArray[np.uint1
     np.testing.assert_array_equal(part, values[3:9, 5:33, 15:18])
     picked = stack.read_frames([9, 0, 4, 4], slice(5, 33), slice(15, 18))
     np.testing.assert_array_equal(picked, values[[9, 0, 4, 4], 5:33, 15:18])
+    in_a_row = stack.read_frames([3, 4, 5], slice(5, 33), slice(15, 18))
+    np.testing.assert_array_equal(in_a_row, values[3:6, 5:33, 15:18])
     assert stack.mask(slice(5, 33), slice(15, 18)).all()
     of_part, mask = stack.read_masked(slice(5, 33), slice(15, 18))
     np.testing.assert_array_equal(of_part, values[:, 5:33, 15:18])
@@ -140,6 +142,22 @@ def test_creating_stack_with_other_slabs_deletes_frames(objects: Objects, values
     for name in ("frames", "thumbnails"):
         chunks = zarr.open_array(objects.zarr, path=f"captures/c/{name}").nchunks
         assert len(objects.paths_below(f"captures/c/{name}/c")) == chunks
+
+
+def test_film_that_an_earlier_version_packed_is_read_until_its_stack_is_created_again(
+    objects: Objects, values: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares = np.zeros((1, 3), np.int64)
+    with monkeypatch.context() as earlier:
+        earlier.setattr(captures, "FRAMES_LAST", ())
+        create(objects, shares=shares)
+    for version in ("earlier", "this"):
+        if version == "this":
+            create(objects, shares=shares)
+        assert Stack(objects, "c").missing() == [0, 1, 2]
+        for first in range(0, 12, 4):
+            write_slab(objects, "c", first, values[first : first + 4])
+        np.testing.assert_array_equal(Stack(objects, "c").read(), values)
 
 
 def test_measurements_are_saved(objects: Objects) -> None:
