@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
@@ -141,9 +142,16 @@ def _fit(
 
     The power is the amount of the first column.
     """
+    groups = [np.ascontiguousarray(group) for group, _ in free]
+    freed = [np.ascontiguousarray(column, np.float64) for _, column in free]
     trust = np.ones(len(value))
     for _ in range(REWEIGHTED):
-        *cleared, r = (_without(v.astype(np.float64), free, trust) for v in (*columns, value))
+        totals = [np.maximum(np.bincount(group, trust * column**2), 1e-20) for group, column in free]
+        *cleared, r = (v.astype(np.float64) for v in (*columns, value))
+        for v in (*cleared, r):
+            for _ in range(SWEEPS):
+                for of_free in zip(groups, freed, totals, strict=True):
+                    _take_out(v, trust, *of_free)
         A = np.stack(cleared, axis=1)
         inverse = np.linalg.pinv((A * trust[:, np.newaxis]).T @ A)
         found = inverse @ (A.T @ (trust * r))
@@ -157,13 +165,21 @@ def _fit(
     return Power(power, error, power**2 / max(inverse[0, 0], 1e-20) / scale**2 if power > 0 else 0.0)
 
 
-def _without(
-    values: Doubles, free: Sequence[tuple[NDArray[np.intp], NDArray[np.floating]]], weight: Doubles
-) -> Doubles:
-    """Values without what is free, by sweeps over the groups of one column and of the next."""
-    for _ in range(SWEEPS):
-        for group, column in free:
-            own = np.bincount(group, weight * values * column)
-            amount = own / np.maximum(np.bincount(group, weight * column**2), 1e-20)
-            values = values - amount[group] * column
-    return values
+@njit(
+    "void(float64[::1], float64[::1], int64[::1], float64[::1], float64[::1])",
+    nogil=True,
+    cache=True,
+)
+def _take_out(
+    values: Doubles, weight: Doubles, group: NDArray[np.int64], column: Doubles, total: Doubles
+) -> None:
+    """Take out of values the amount of a column that each of its groups has, by weighted least squares.
+
+    ``total`` is the weighted sum of the column's squares in each group.
+    """
+    amount = np.zeros(len(total))
+    for n in range(len(values)):
+        amount[group[n]] += weight[n] * values[n] * column[n]
+    amount /= total
+    for n in range(len(values)):
+        values[n] -= amount[group[n]] * column[n]
