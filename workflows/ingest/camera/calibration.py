@@ -89,7 +89,7 @@ def calibrate(
     """
     program = Program.model_validate(stack.attributes["program"])
     sample = Sample(stack, find_lit(stack, program))
-    filmed = sample.every_frame() if "video" in stack.attributes else None
+    filmed = sample.every_frame()
     stack.annotate(tone_mapping=tone_mapping, clipped_from=_clipped_from(stack, filmed))
     gain = local_gain(stack)
     constants = constant_frames(stack, program)
@@ -176,6 +176,7 @@ def _camera(
     exposed = automatic_exposures(stack.attributes.get("stated_exposures"))
     scaled = False
     for _ in range(TURNS if border else 1):
+        before = camera
         look_up = table(
             "srgb" if camera == "unknown" else camera, stack.dtype, stack.attributes["storage"]["black"]
         )
@@ -187,6 +188,8 @@ def _camera(
         elif seen:
             curve, scaled = fit_camera_curve(seen, stack.channels)
             camera = curve or "unknown"
+        if camera == before:  # so is all that follows from it
+            break
     if exposed is not None and np.log(exposed).std() < TRIFLE:
         exposed = None
     if exposed is not None and is_free(exposed):

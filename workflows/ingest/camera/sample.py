@@ -35,20 +35,29 @@ class Sample:
     def __init__(self, stack: Stack, seen: NDArray[np.bool_]) -> None:
         self._stack, self._seen = stack, seen
         self._squares = windows(seen, int(SAMPLES**0.5) // 4)
+        # A film is measured by every frame: its squares are read once.
+        self._filmed = (
+            [stack.read(*square) for square in self._squares] if "video" in stack.attributes else None
+        )
         self.places = np.concatenate([_places(square, seen[square]) for square in self._squares], axis=1)
 
     def codes(self, frames: list[int]) -> NDArray[Any]:
         """Values of frames, (frames, n, 3)."""
-        parts = [self._stack.read_frames(frames, *square)[:, self._seen[square]] for square in self._squares]
+        if self._filmed is None:
+            read = [self._stack.read_frames(frames, *square) for square in self._squares]
+        else:
+            read = [values[frames] for values in self._filmed]
+        parts = [values[:, self._seen[square]] for values, square in zip(read, self._squares, strict=True)]
         pixels = np.concatenate(parts, axis=1)
         return np.broadcast_to(pixels, (*pixels.shape[:2], 3))
 
-    def every_frame(self) -> "FilmedPixels":
-        """Some of the pixels to recover, in all frames."""
-        read = [self._stack.read_masked(*square) for square in self._squares]
-        chosen = [mask & self._seen[square] for square, (_, mask) in zip(self._squares, read, strict=True)]
+    def every_frame(self) -> "FilmedPixels | None":
+        """Some of the pixels to recover, in all frames; None unless it is a film."""
+        if self._filmed is None:
+            return None
+        chosen = [self._stack.mask(*square) & self._seen[square] for square in self._squares]
         codes = np.concatenate(
-            [values[:, some] for (values, _), some in zip(read, chosen, strict=True)], axis=1
+            [values[:, some] for values, some in zip(self._filmed, chosen, strict=True)], axis=1
         ).transpose(1, 0, 2)
         places = np.concatenate([_places(*one) for one in zip(self._squares, chosen, strict=True)], axis=1)
         step = -(-len(codes) // COMPRESSED_SAMPLES) or 1

@@ -70,13 +70,10 @@ class Film:
     def read_some(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.uint16]:
         return self.codes[:, rows][:, :, columns]
 
-    def mask(self) -> NDArray[np.bool_]:
+    def mask(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.bool_]:
         mask = np.zeros((self.height, self.width), bool)
         mask[8:52] = True
-        return mask
-
-    def read_masked(self, rows: slice, columns: slice) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
-        return self.read(rows, columns), self.mask()[rows, columns]
+        return mask[rows, columns]
 
     def thumbnails(self, frames: NDArray[np.intp]) -> NDArray[np.uint16]:
         return np.asarray(np.rint(self.codes[frames].mean(axis=3)), np.uint16)
