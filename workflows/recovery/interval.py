@@ -128,17 +128,18 @@ def fit_interval(
     -----
     Light from far away is wrong where the backdrop has no contrast, too: the ``share`` is that by which, among the
     `CALM` fifth of the errors with least contrast, 90 % lie in their interval, the noise of the measurement included.
-    The ``contrast`` is then that by which 90 % of all do; not more than 1, as if light came from anywhere around, and
-    if that is not enough, the share is larger again. Both are those of the capture: which of its pixels are better
-    recovered than others, the contrast that they see tells only in part. Fewer patterns make larger errors, so
-    intervals are a little too wide.
+    The ``contrast`` is then that by which 90 % of all do. If it had to be more than 1, as if light came from beyond all
+    that is around, it is not contrast that makes the errors, and the share alone is fitted to all. Both are those of
+    the capture: which of its pixels are better recovered than others, the contrast that they see tells only in part.
+    Fewer patterns make larger errors, so intervals are a little too wide.
     """
     each = FIT_VARIANCE / max(frames, 1.0)
     known = variance * (1 + each)
     calm = contrast <= np.quantile(contrast, CALM)
     further = _least_of(error[calm], np.ones(np.count_nonzero(calm)), known[calm])
-    found = min(_least_of(error, contrast, known + further), 1.0)
-    further += _least_of(error, np.ones(error.size), known + further + found * contrast)
+    found = _least_of(error, contrast, known + further)
+    if found > 1:
+        found, further = 0.0, _least_of(error, np.ones(error.size), known)
     in_measurement, in_composite = errors
     share = each * in_measurement**2 + in_composite**2 + further / rho**2
     return Interval(found, each * noise.read, each * noise.shot, share)
