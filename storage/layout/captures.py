@@ -101,14 +101,16 @@ def create_stack(
 
     Notes
     -----
-    There are as few slabs as the memory allows, of one length but for the last. A chunk is the frames of a slab over a
+    There are as few slabs as the memory allows, but an even number of them, so that two workers take equally long. They
+    are of one length but for the last. A chunk is the frames of a slab over a
     square of pixels. The edge of the square doubles, beginning with that of a block (`block_edge`), until a chunk has
     about `CHUNK` bytes: a tile reads few chunks, and few bytes that it does not need.
     """
     frames, height, width, channels = shape
     pixel = channels * dtype.itemsize
     most = max(1, memory // (2 * height * width * pixel))
-    slab = -(-frames // -(-frames // most))
+    fewest = -(-frames // most)
+    slab = -(-frames // (fewest + (fewest % 2 if fewest > 1 else 0)))
     edge = block_edge(height, width)
     while edge < max(height, width) and 2 * slab * edge * edge * pixel <= CHUNK:
         edge *= 2

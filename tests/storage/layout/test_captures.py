@@ -14,7 +14,7 @@ from storage.layout.blocks import block_edge
 from storage.layout.captures import Stack, Strips, create_stack, write_slab
 from storage.objects.store import Objects
 
-SHAPE = (11, 37, 50, 3)
+SHAPE = (14, 37, 50, 3)
 
 
 def create(
@@ -36,7 +36,7 @@ def values() -> NDArray[np.uint16]:
     return made
 
 
-def fill(objects: Objects, values: NDArray[np.uint16], order: tuple[int, ...] = (0, 1, 2)) -> Stack:
+def fill(objects: Objects, values: NDArray[np.uint16], order: tuple[int, ...] = (0, 1, 2, 3)) -> Stack:
     assert create(objects) == 4
     for slab in order:
         write_slab(objects, "c", slab * 4, values[slab * 4 : slab * 4 + 4])
@@ -64,7 +64,7 @@ def test_written_frames_are_read_back(objects: Objects, values: NDArray[np.uint1
     assert stack.images() == []
 
 
-@pytest.mark.parametrize("order", [(2, 0, 1), (1, 2, 0, 1, 1)])
+@pytest.mark.parametrize("order", [(2, 0, 3, 1), (1, 2, 0, 3, 1, 1)])
 def test_order_of_slabs_does_not_change_bytes(
     objects: Objects,
     values: NDArray[np.uint16],
@@ -86,7 +86,7 @@ def test_masks_and_images_are_read_back(objects: Objects) -> None:
     images = [rng.random((n, 3, 1 + 2 * (n % 2)), np.float32) for n in range(1, 12)]
     create(objects, mask=mask, images=images)
     frames = rng.integers(0, 65536, SHAPE, np.uint16)
-    for slab in (0, 4, 8):
+    for slab in (0, 4, 8, 12):
         write_slab(objects, "c", slab, frames[slab : slab + 4])
     stack = Stack(objects, "c")
     np.testing.assert_array_equal(stack.read_masked()[1], mask)
@@ -108,8 +108,8 @@ def test_slab_and_chunks_are_bounded(objects: Objects, memory: int, shape: tuple
     frame, slabs = int(np.prod(shape[1:])), -(-shape[0] // slab)
     assert 1 <= slab <= shape[0]
     assert slab == 1 or slab * frame <= memory / 2
-    # One slab less would not fit, and these are as short as so many can be.
-    assert slabs == 1 or -(-shape[0] // (slabs - 1)) * frame > memory / 2
+    # The next smaller even number would not fit, and these are as short as so many can be.
+    assert slabs == 1 or -(-shape[0] // max(slabs - 2, 1)) * frame > memory / 2
     assert (slab - 1) * slabs < shape[0]
     chunks = zarr.open_array(objects.zarr, path="captures/c/frames").chunks
     edge = block_edge(shape[1], shape[2])
@@ -117,6 +117,12 @@ def test_slab_and_chunks_are_bounded(objects: Objects, memory: int, shape: tuple
     assert int(np.prod(chunks)) <= max(2 * captures.CHUNK, least)
     for size, n in zip(chunks[1:3], shape[1:3], strict=True):
         assert size == n or size % edge == 0
+
+
+@pytest.mark.parametrize(("most", "slab"), [(140, 140), (139, 70), (47, 35), (21, 18), (20, 18), (18, 18)])
+def test_two_workers_write_as_many_slabs_each(objects: Objects, most: int, slab: int) -> None:
+    assert create(objects, shape=(140, 3, 4, 1), slab=most) == slab
+    assert -(-140 // slab) in (1, 2, 4, 8)
 
 
 def test_creating_stack_again_keeps_frames_and_measurements(
@@ -135,8 +141,8 @@ def test_creating_stack_with_other_slabs_deletes_frames(objects: Objects, values
     fill(objects, values)
     assert create(objects, slab=3) == 3
     stack = Stack(objects, "c")
-    assert stack.missing() == [0, 1, 2, 3]
-    for first in range(0, 11, 3):
+    assert stack.missing() == [0, 1, 2, 3, 4]
+    for first in range(0, 14, 3):
         write_slab(objects, "c", first, values[first : first + 3])
     np.testing.assert_array_equal(stack.read(), values)
     for name in ("frames", "thumbnails"):
@@ -154,8 +160,8 @@ def test_film_that_an_earlier_version_packed_is_read_until_its_stack_is_created_
     for version in ("earlier", "this"):
         if version == "this":
             create(objects, shares=shares)
-        assert Stack(objects, "c").missing() == [0, 1, 2]
-        for first in range(0, 12, 4):
+        assert Stack(objects, "c").missing() == [0, 1, 2, 3]
+        for first in range(0, 14, 4):
             write_slab(objects, "c", first, values[first : first + 4])
         np.testing.assert_array_equal(Stack(objects, "c").read(), values)
 
@@ -182,8 +188,8 @@ def test_missing_chunk_is_corrupt(objects: Objects, folder: Path, values: NDArra
 @pytest.mark.parametrize("name", ["mask", "images/0"])
 def test_missing_chunk_of_mask_or_image_is_corrupt(objects: Objects, folder: Path, name: str) -> None:
     create(objects, mask=np.zeros(SHAPE[1:3], bool), images=[np.zeros((4, 4, 1), np.float32)])
-    for slab in (0, 4, 8):
-        write_slab(objects, "c", slab, np.zeros((min(4, 11 - slab), *SHAPE[1:]), np.uint16))
+    for slab in (0, 4, 8, 12):
+        write_slab(objects, "c", slab, np.zeros((min(4, 14 - slab), *SHAPE[1:]), np.uint16))
     stack = Stack(objects, "c")
     assert not stack.read_masked()[1].any()
     assert not stack.images()[0].any()
@@ -194,7 +200,7 @@ def test_missing_chunk_of_mask_or_image_is_corrupt(objects: Objects, folder: Pat
 
 
 def test_slab_that_was_never_written_is_corrupt(objects: Objects, values: NDArray[np.uint16]) -> None:
-    stack = fill(objects, values, order=(0, 2))
+    stack = fill(objects, values, order=(0, 2, 3))
     assert stack.missing() == [1]
     with pytest.raises(Corrupt):
         stack.read()
@@ -232,7 +238,7 @@ def test_stack_begun_by_an_earlier_version_has_no_thumbnails(
 ) -> None:
     create(objects)
     (folder / "captures/c/thumbnails/zarr.json").unlink()
-    for slab in (0, 4, 8):
+    for slab in (0, 4, 8, 12):
         write_slab(objects, "c", slab, values[slab : slab + 4])
     stack = Stack(objects, "c")
     assert stack.thumbnails() is None
