@@ -97,8 +97,16 @@ def test_two_writers_of_a_file_do_not_meet(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["matte.zip"]
 
 
+@pytest.fixture
+def hangups_end() -> Iterator[None]:
+    """What is started ends at SIGHUP, although `nohup pytest` ignores it, and so would all that it starts."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_an_export_that_is_ended_leaves_nothing(tmp_path: Path, number: int) -> None:
+def test_an_export_that_is_ended_leaves_nothing(tmp_path: Path, number: int, hangups_end: None) -> None:
     begun, ended = threading.Event(), threading.Event()
 
     class Slow(BaseHTTPRequestHandler):
