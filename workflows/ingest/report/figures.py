@@ -65,7 +65,8 @@ class Flicker(BaseModel):
     """How much the monitor's light varied between frames, in per cent: standard deviation and worst frame.
 
     ``error`` is the standard error of a frame. ``follows`` is the correlation of the frames' light with the patterns'
-    own. ``corrected`` says whether recovery corrects it.
+    own. ``white_percent`` is by how much white frames are brighter than what is white in patterns, if that is known.
+    ``corrected`` says whether recovery corrects it.
     """
 
     percent: float
@@ -73,6 +74,7 @@ class Flicker(BaseModel):
     worst_percent: float
     worst_frame: int
     follows: float = 0.0
+    white_percent: float = 0.0
     frames: int
     corrected: bool
 

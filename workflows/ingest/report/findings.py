@@ -25,6 +25,8 @@ from workflows.programs.program import Program
 
 SURE = 4.0
 """A drift or flicker is real from so many standard errors on."""
+DIMMED = 3.0
+"""Per cent by which white frames differ from white in patterns from which on they, and half-tones, tell less."""
 FOLLOWS = -0.25
 """Correlation of frames' light with their patterns' own below which the camera brightens dark pictures."""
 
@@ -47,6 +49,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     files = attributes.get("files")  # missing from films, and captures of earlier versions
     if attributes.get("order"):  # what else would be found means nothing
         return [order(**attributes["order"], files=files), frames(figures)]
+    white = figures.flicker.white_percent if figures.flicker else 0.0
     found = [
         *odd_frames(attributes.get("odd_frames", []), files),
         # What followed the camera's own exposure is corrected.
@@ -59,7 +62,8 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         *_steadiness(attributes),
         *_drift(figures.drift),
         *_scaling(program, scaled=attributes.get("scaled", False)),
-        *curves(figures, program, linear=attributes["storage"]["black"] > 0),
+        *_white_apart(white),
+        *curves(figures, program, linear=attributes["storage"]["black"] > 0, dimmed=abs(white) >= DIMMED),
         *_glare(attributes.get("glare")),
         _crosstalk(figures, program, grey=survey.get("grey", False)),
         *unexplained(costs["model_error"], model_error_of(attributes)),
@@ -215,13 +219,30 @@ def _flicker(flicker: Flicker | None, files: list[str] | None, *, mapped: bool) 
             + (": recovery corrects it" if flicker.corrected else ""),
             remedy=""
             if level == "good"
-            else "switch automatic exposure and the monitor's dimming off, let the monitor warm up, and expose "
-            "for whole periods of its refresh"
+            else "switch automatic exposure and the monitor's dimming off, leave the light of the room as it is, let "
+            "the monitor warm up, and expose for whole periods of its refresh"
             + (
                 ": so much is corrected only in part"
                 if flicker.corrected
                 else ": it is not corrected, because it is not certain, or no frame is black"
             ),
+        )
+    ]
+
+
+def _white_apart(percent: float) -> list[Finding]:
+    """White frames that are darker, or brighter, than what is white in patterns."""
+    if abs(percent) < DIMMED:
+        return []
+    return [
+        Finding(
+            name="white",
+            level=graded(abs(percent), DIMMED, 25.0),
+            message=f"a white monitor differs by {percent:+.0f} % from what is white in patterns, as when a monitor "
+            "limits its brightness, or exposure is not locked: recovery corrects it, and composites are exposed as "
+            "patterns were",
+            remedy="lock exposure and ISO, make the monitor darker, and switch its dimming off: the camera's curve "
+            "can't be told from half-tones that are dimmed too",
         )
     ]
 

@@ -118,17 +118,19 @@ def lost_colour(program: Program, cost: float, *, half_colour: bool) -> list[Fin
     ]
 
 
-def curves(figures: Figures, program: Program, *, linear: bool) -> list[Finding]:
+def curves(figures: Figures, program: Program, *, linear: bool, dimmed: bool) -> list[Finding]:
     """The tone curves that were measured or don't matter, and those that are assumed.
 
     Parameters
     ----------
     linear : bool
         Whether the frames' format holds linear light.
+    dimmed : bool
+        Whether white differs between white frames and patterns: then half-tones do not tell whether a curve is right.
     """
     found = []
     camera, monitor = figures.camera, figures.monitor
-    off = camera.apart is not None and abs(camera.apart) > APART
+    off = camera.apart is not None and abs(camera.apart) > APART and not dimmed
     if camera.source == "assumed":
         found.append(_assumed("camera", camera.curve))
     elif off and camera.source == "given":
@@ -142,7 +144,7 @@ def curves(figures: Figures, program: Program, *, linear: bool) -> list[Finding]
                 remedy='set `"response": "unknown"` in capture.json: the curve is then measured from the half-tones',
             )
         )
-    elif linear or camera.source == "estimated" or camera.apart is not None:
+    elif linear or ((camera.source == "estimated" or camera.apart is not None) and not dimmed):
         how = (
             "as the format of the frames says"
             if linear

@@ -16,6 +16,8 @@ SETTLED = (0.003, 0.0005)
 """Rounds end when shifts, in pixels, and gains change less than this, root mean square."""
 MIN_DRIFT, MIN_FLICKER = 0.01, 0.003
 """Drift (root mean square, pixels) and flicker (standard deviation of the gain) below these are not corrected."""
+MIN_APART = 0.02
+"""Nor are gains of constant frames that differ by less from those of patterns, as they do by errors of curves."""
 TRIFLE = 0.5
 """The first trial sees only part of a disturbance: more rounds follow if it finds this share of `MIN_DRIFT` or
 `MIN_FLICKER`,"""
@@ -93,10 +95,10 @@ class Search(NamedTuple):
         moves = flickers = False
         believed = np.ones(2, bool)
         least = np.array([MIN_DRIFT, MIN_FLICKER])
-        size, error = sizes_of(found, first, self.shown)
+        size, error = sizes_of(found - self.begin, first, self.shown)
         if ((size > TRIFLE * least) & (size > LOOK_AGAIN * error)).any():
             found, last, left = self.settle(first)
-            size, error = sizes_of(found, last, self.shown)
+            size, error = sizes_of(found - self.begin, last, self.shown)
             there = (size >= least) & (size >= SURE * error)
             sure = (
                 there & (sizes_of(left, last, self.shown)[0] <= REST * size) & are_within(found, self.shown)
@@ -134,7 +136,8 @@ class Search(NamedTuple):
                 break
             state, trial = ahead, again
             left = self._left_by(trial)
-            if size_of(left[self.shown, :2]) < SETTLED[0] and size_of(left[self.shown, 2:]) < SETTLED[1]:
+            still = size_of(left[self.shown, :2]) < SETTLED[0] and size_of(left[self.shown, 2:]) < SETTLED[1]
+            if still and not constants_apart(left, trial, self.shown):
                 return state, trial, left
             tried.append((state, trial))
             least.append(min(least[-1], trial.residual**2))
@@ -197,8 +200,23 @@ def size_of(values: Doubles) -> float:
 def sizes_of(found: Doubles, trial: Trial, shown: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
     """Size of the drift and of the flicker, root mean square, and the standard errors of most frames."""
     error = trial.error[shown]
-    size = np.array([size_of(found[shown, :2]), found[shown, 2].std()])
-    return size, np.array([usual_error(error[:, :2]), usual_error(error[:, 2:])])
+    flicker = max(float(found[shown, 2].std()), constants_apart(found, trial, shown))
+    return np.array([size_of(found[shown, :2]), flicker]), np.array(
+        [usual_error(error[:, :2]), usual_error(error[:, 2:])]
+    )
+
+
+def constants_apart(found: Doubles, trial: Trial, shown: NDArray[np.bool_]) -> float:
+    """By how much gains of constant frames differ from the mean of patterns', root mean square; 0 below `MIN_APART`.
+
+    All patterns are about as bright as each other, and white is twice as bright. So a monitor that limits its
+    brightness, or an exposure that is not locked, may differ between white and patterns alone.
+    """
+    constant = ~shown & np.isfinite(trial.off[:, 2])
+    if not constant.any():
+        return 0.0
+    apart = size_of((found[constant, 2] - found[shown, 2].mean())[:, np.newaxis])
+    return apart if apart >= MIN_APART else 0.0
 
 
 def usual_error(errors: Doubles) -> float:

@@ -113,7 +113,11 @@ def find_steadiness(
     found = Search(try_out, begin, shown, has_black and not free).run(first, at_rest.residual)
     corrected = found.to_correct(begin)
     gains = np.exp(corrected[:, 2] - (0 if free else np.median(corrected[shown, 2])))
-    figures = _figures(found, shown, _brightness(light, program, patterns[shown])) if found.is_known else {}
+    numbers, sent = program.constants
+    level = sent.sum(axis=1)
+    white = np.isin(patterns, numbers[level == level.max()]) & np.isfinite(found.trial.off[:, 2])
+    bright = _brightness(light, program, patterns[shown])
+    figures = _figures(found, shown, white, bright) if found.is_known else {}
     stack.annotate(
         steadiness=figures | {"flicker": None} if free and figures else figures,
         shifts=corrected[:, :2].round(4).tolist() if found.moves else None,
@@ -132,12 +136,16 @@ def _brightness(light: Patterns, program: Program, patterns: NDArray[np.int_]) -
     return mean
 
 
-def _figures(found: Found, shown: NDArray[np.bool_], bright: Doubles) -> dict[str, Any]:
+def _figures(
+    found: Found, shown: NDArray[np.bool_], white: NDArray[np.bool_], bright: Doubles
+) -> dict[str, Any]:
     """The figures of drift and flicker; of what is beyond the limits of the search, and so something else, None."""
     off, error = found.off, found.trial.error
     gain = np.exp(off[:, 2] - np.median(off[shown, 2]))
     drift = _drift(off[shown, :2], error[shown, :2]) | {"corrected": found.moves}
     flicker = _flicker(gain, error[:, 2], np.flatnonzero(shown), bright) | {"corrected": found.flickers}
+    if found.flickers and white.any():
+        flicker["white_percent"] = float(100 * (gain[white].mean() - 1))
     within = are_within(off, shown)
     return {"drift": drift if within[0] else None, "flicker": flicker if within[1] else None}
 

@@ -35,6 +35,8 @@ MOST_GLARE = 0.7
 """A larger share of the light is no glare: the sample sees something else, such as mostly the border of a film."""
 HIDDEN = 1.5
 """Ratio of the variance of patterns to that of constant frames from which these hide noise."""
+BRIGHTER = 0.04
+"""In units of T, 2 % of the light: less than that is due to glare, and to curves that are not quite right."""
 MIN_FLAT = 120
 """Values that the noise and the error of the model are measured from, at least."""
 CONTRAST = 3.0
@@ -196,9 +198,12 @@ class Rest:
                 return noise, 0.0
             own, other = self.rest[flat], np.roll(self.rest, -1, axis=1)[flat]
             common = _mean_without_outliers(own * other)
+            # Under patterns in colour a channel may see white, and the next one black.
+            lit = (self.plain > 0).astype(np.float32)
+            apart = own - other - self._brighter() * (lit - np.roll(lit, -1, axis=1))[flat]
             # The variance of a difference, in units of T, is the sum of two: that of a frame over rho squared of each.
             rho, of_other = self.rho[flat] ** 2, np.roll(self.rho, -1, axis=1)[flat] ** 2
-            square = (own - other) ** 2 / 4 * rho * of_other / (rho + of_other)
+            square = apart**2 / 4 * rho * of_other / (rho + of_other)
         else:
             flat = self.flat
             square = (self.rest[flat] / 2 * self.rho[flat]) ** 2
@@ -222,6 +227,12 @@ class Rest:
                     noise = limit
         error = float(np.sqrt(max(common, 0.0)) / 2)
         return noise, error if error >= LEAST_ERROR else 0.0
+
+    def _brighter(self) -> float:
+        """By how much what is white in patterns is brighter than white frames; 0 below `BRIGHTER`."""
+        white = self.rest[self.flat & (self.plain > 0)]
+        more = float(np.median(white)) if white.size else 0.0
+        return more if abs(more) >= BRIGHTER else 0.0
 
     def smooth_error(self, sample: PixelSample, otherwise: float) -> float:
         """The error of the model in a film by pixels above each other, where both see a pattern alike."""

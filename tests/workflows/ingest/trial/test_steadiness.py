@@ -185,6 +185,25 @@ def test_flicker_is_found_and_taken_out(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "ball", [pytest.param("default", marks=pytest.mark.exhaustive), "quick"], indirect=True
+)
+def test_white_that_the_monitor_dims_is_found_and_evened_out(
+    ingest: Ingest, objects: Objects, ball: Ball
+) -> None:
+    shifts, gains = steady(ball)
+    numbers, sent = ball[1].constants
+    gains[numbers[(sent == 1).all(axis=1)]] = 0.75
+    stack, found, with_it, without = compared(ingest, objects, ball, shifts, gains)
+    flicker = stack.attributes["steadiness"]["flicker"]
+    assert flicker["corrected"]
+    assert flicker["white_percent"] == pytest.approx(-25, abs=1)
+    assert "camera_curve" not in found  # half-tones, which are not dimmed, do not tell
+    assert "limits its brightness" in found["white"].message
+    assert with_it > without + 15
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("ball", ["quick"], indirect=True)
 def test_scaled_patterns_do_not_flicker_and_are_recovered_as_the_monitor_interpolates_them(
     ingest: Ingest, objects: Objects, ball: Ball
