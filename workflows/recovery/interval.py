@@ -89,7 +89,7 @@ def local_contrast(pyramid: Pyramid, mean: Floats, square: Floats) -> Floats:
     at = slice(pyramid.starts[reach], pyramid.starts[reach + 1])
     variance = np.maximum(square[at] - mean[at] ** 2, 0).reshape(rows, columns, -1)
     finer = [
-        variance[np.arange(high)[:, np.newaxis] >> by, np.arange(wide) >> by].reshape(wide * high, -1)
+        variance.repeat(1 << by, axis=1)[:, :wide].repeat(1 << by, axis=0)[:high].reshape(wide * high, -1)
         for by, (wide, high) in zip(range(reach, 0, -1), pyramid.grids, strict=False)
     ]
     return np.concatenate([*finer, around.light(variance)])
