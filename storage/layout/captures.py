@@ -101,16 +101,18 @@ def create_stack(
 
     Notes
     -----
-    There are as few slabs as the memory allows, but an even number of them, so that two workers take equally long. They
-    are of one length but for the last. A chunk is the frames of a slab over a
-    square of pixels. The edge of the square doubles, beginning with that of a block (`block_edge`), until a chunk has
-    about `CHUNK` bytes: a tile reads few chunks, and few bytes that it does not need.
+    There is one slab, or as few as the memory allows of an even number, so that two workers take equally long. They are
+    of one length but for the last. A chunk is the frames of a slab over a square of pixels. The edge of the square
+    doubles, beginning with that of a block (`block_edge`), until a chunk has about `CHUNK` bytes: a tile reads few
+    chunks, and few bytes that it does not need.
     """
     frames, height, width, channels = shape
     pixel = channels * dtype.itemsize
     most = max(1, memory // (2 * height * width * pixel))
-    fewest = -(-frames // most)
-    slab = -(-frames // (fewest + (fewest % 2 if fewest > 1 else 0)))
+    slabs = -(-frames // most)
+    if slabs > 1:
+        slabs += slabs % 2
+    slab = -(-frames // slabs)
     edge = block_edge(height, width)
     while edge < max(height, width) and 2 * slab * edge * edge * pixel <= CHUNK:
         edge *= 2

@@ -198,12 +198,14 @@ def size_of(values: Doubles) -> float:
 
 
 def sizes_of(found: Doubles, trial: Trial, shown: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
-    """Size of the drift and of the flicker, root mean square, and the standard errors of most frames."""
+    """Size of the drift and of the flicker, root mean square, and the standard errors of most frames.
+
+    The flicker is that of patterns, or the difference between them and constant frames if that is larger.
+    """
     error = trial.error[shown]
     flicker = max(float(found[shown, 2].std()), constants_apart(found, trial, shown))
-    return np.array([size_of(found[shown, :2]), flicker]), np.array(
-        [usual_error(error[:, :2]), usual_error(error[:, 2:])]
-    )
+    size = np.array([size_of(found[shown, :2]), flicker])
+    return size, np.array([usual_error(error[:, :2]), usual_error(error[:, 2:])])
 
 
 def constants_apart(found: Doubles, trial: Trial, shown: NDArray[np.bool_]) -> float:
