@@ -16,7 +16,7 @@ from workflows.simulation import glass_ball
 from workflows.simulation.scene import write_capture
 
 FAKETIME = "faketime/libfaketimeMT.so.1"
-"""A library that makes up the time for a process, see `.ci/run`."""
+"""A library that makes up the time for a process, of the package faketime."""
 
 pytestmark = pytest.mark.timeout(7200)
 
