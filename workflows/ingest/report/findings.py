@@ -242,7 +242,7 @@ def _white_apart(percent: float) -> list[Finding]:
             "limits its brightness, or exposure is not locked: recovery corrects it, and composites are exposed as "
             "patterns were",
             remedy="lock exposure and ISO, make the monitor darker, and switch its dimming off: the camera's curve "
-            "can't be told from half-tones that are dimmed too",
+            "can't be measured by half-tones that are dimmed too",
         )
     ]
 

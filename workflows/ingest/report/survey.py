@@ -157,7 +157,7 @@ class _Windows:
         kept: dict[int, Codes] = {}
         for at, codes in _batches(self._stack, rows, columns, chosen):
             for end, there in enumerate((codes == 0, codes >= self._top)):
-                # Channel by channel, which takes a fifth of the time of `any`.
+                # Channel by channel, which takes a ninth of the time of `any`.
                 in_any = np.logical_or.reduce([there[..., c] for c in range(there.shape[3])])
                 self._clipped[end, at] += np.count_nonzero(in_any & wanted, axis=(1, 2))
             found = dict(zip(chosen[at].tolist(), codes, strict=True))

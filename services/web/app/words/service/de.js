@@ -148,7 +148,7 @@ export const de = {
 	"let the glass fill more of the frame, or shoot RAW": "das Glas mehr vom Bild füllen lassen oder RAW aufnehmen",
 	"let the recording go on until after the program": "die Aufnahme erst nach dem Programm beenden",
 	"lock exposure and ISO before filming": "Belichtung und ISO vor dem Filmen festhalten",
-	"lock exposure and ISO, make the monitor darker, and switch its dimming off: the camera's curve can't be told from half-tones that are dimmed too": "Belichtung und ISO festhalten, den Monitor dunkler stellen und sein Abdunkeln ausschalten: An Halbtönen, die auch abgedunkelt sind, ist die Kennlinie der Kamera nicht zu erkennen",
+	"lock exposure and ISO, make the monitor darker, and switch its dimming off: the camera's curve can't be measured by half-tones that are dimmed too": "Belichtung und ISO festhalten, den Monitor dunkler stellen und sein Abdunkeln ausschalten: An Halbtönen, die auch abgedunkelt sind, ist die Kennlinie der Kamera nicht zu erkennen",
 	"make a key with `envmatte keys make NAME`, and {start}": "einen Schlüssel mit `envmatte keys make NAME` anlegen und {start}",
 	"make the archive again, with one still of each pattern in the order in which they were shown": "das Archiv neu packen, mit je einem Foto der Muster in der gezeigten Reihenfolge",
 	"matte {id} has {limit} links already: delete one first": "Matte {id} hat schon {limit} Links: erst einen löschen",
