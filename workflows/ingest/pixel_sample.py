@@ -11,14 +11,8 @@ from workflows.images.integer_formats import Codes
 from workflows.images.resample import LANCZOS_LOBES
 from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.light.local_gain import local_gain
-from workflows.ingest.light.measured_light import (
-    clipped_from,
-    even_out,
-    look_up_of,
-    odd_frames,
-    unclipped_light,
-)
-from workflows.programs.program import Program
+from workflows.ingest.light.measured_light import even_out, unclipped_light
+from workflows.ingest.light.stack_attributes import clipped_from, look_up_of, odd_frames, program_of
 
 EDGE = 8
 """Side in pixels of the squares that are examined."""
@@ -125,7 +119,7 @@ def take_sample(stack: Stack, masked: bool = True) -> PixelSample | None:
     """Choose squares spread over the pixels to recover that see the monitor, and pixels in them; None if there are too
     few. Unless ``masked``, all that see the monitor are taken for those to recover.
     """
-    wanted = find_lit(stack, Program.model_validate(stack.attributes["program"]))
+    wanted = find_lit(stack, program_of(stack.attributes))
     if masked:
         wanted &= stack.mask()
     down, across = (np.arange(MARGIN, size - MARGIN - EDGE + 1, EDGE) for size in wanted.shape)

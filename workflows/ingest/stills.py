@@ -210,14 +210,13 @@ def storage_of(
 
 def _constants(manifest: Manifest) -> tuple[str, str]:
     """The frames of the darkest and of the brightest constant pattern, each in its longest exposure."""
-    numbers, sent = manifest.program.constants_among([frame.pattern for frame in manifest.frames])
-    levels = sent.sum(axis=1)
 
-    def longest(pattern: int) -> str:
+    def longest(pattern: np.intp) -> str:
         frames = [frame for frame in manifest.frames if frame.pattern == pattern]
         return max(frames, key=lambda frame: frame.exposure).file
 
-    return longest(int(numbers[np.argmin(levels)])), longest(int(numbers[np.argmax(levels)]))
+    darkest, brightest = manifest.program.ends([frame.pattern for frame in manifest.frames])
+    return longest(darkest[0]), longest(brightest[0])
 
 
 def _full_scale(

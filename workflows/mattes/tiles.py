@@ -12,14 +12,11 @@ from storage.layout.captures import Stack
 from storage.layout.mattes import Block, Matte, empty_block
 from storage.objects.store import Objects
 from workflows.images.tone_curves import Curve
+from workflows.ingest.light import stack_attributes
 from workflows.ingest.light.local_gain import Surroundings, local_gain
-from workflows.ingest.light.measured_light import (
-    conditions_of,
-    monitor_curve_of,
-    observe,
-    places_in,
-    read_light,
-)
+from workflows.ingest.light.measured_light import places_in, read_light
+from workflows.ingest.light.observation import conditions_of, observe
+from workflows.ingest.light.stack_attributes import monitor_curve_of
 from workflows.mattes.cut_out import CutOut
 from workflows.mattes.options import RecoveryOptions
 from workflows.programs.program import Program
@@ -207,7 +204,7 @@ def grid_of(objects: Objects, capture: str, options: RecoveryOptions) -> tuple[i
 def program_of(objects: Objects, capture: str) -> tuple[Program, Curve]:
     """A capture's program and monitor curve, kept from tile to tile: a capture never changes."""
     attributes = Stack(objects, capture).attributes
-    return Program.model_validate(attributes["program"]), monitor_curve_of(attributes)
+    return stack_attributes.program_of(attributes), monitor_curve_of(attributes)
 
 
 @lru_cache(maxsize=1)

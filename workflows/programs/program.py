@@ -103,6 +103,12 @@ class Program(Record):
         return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
 
     @property
+    def black(self) -> NDArray[np.intp]:
+        """Numbers of the constant patterns that are black."""
+        numbers, sent = self.constants
+        return numbers[~sent.any(axis=1)]
+
+    @property
     def in_colour(self) -> bool:
         """Whether any random pattern or stripes are in colour."""
         return any(part.channels > 1 for part in self.parts if isinstance(part, Bernoulli | Stripes))
@@ -123,6 +129,12 @@ class Program(Record):
         numbers, sent = self.constants
         present = np.isin(numbers, patterns)
         return numbers[present], sent[present]
+
+    def ends(self, patterns: Sequence[int] | None = None) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Numbers of the darkest constant patterns, and of the brightest, among all or among ``patterns``."""
+        numbers, sent = self.constants if patterns is None else self.constants_among(patterns)
+        level = sent.sum(axis=1)
+        return numbers[level == level.min()], numbers[level == level.max()]
 
     def tells(self, patterns: Sequence[int]) -> bool:
         """Whether these patterns suffice for S, rho and T: two different constant levels and one that is not."""

@@ -23,7 +23,8 @@ from tests.benchmarks.field.methods.rivals import LASSO, NNLS, OMP
 from tests.benchmarks.recovery.kits import load, served
 from tests.benchmarks.recovery.solvers import Recover
 from workflows.images.tone_curves import to_light
-from workflows.ingest.light.measured_light import constants_of, read_light
+from workflows.ingest.light.measured_light import read_light
+from workflows.ingest.light.observation import constants_of
 from workflows.mattes import tiles
 from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.pattern_light import PatternLight

@@ -79,6 +79,19 @@ def test_patterns_are_numbered_through_the_parts() -> None:
             np.testing.assert_array_equal(part, whole)
 
 
+def test_ends_are_the_darkest_and_the_brightest_constants_of_all_or_of_some() -> None:
+    colours = [[1, 1, 1], [0, 0, 0], [0, 0, 1], [0, 0, 0]]
+    made = Program.model_validate(
+        {
+            "monitor": {"width": 96, "height": 72},
+            "parts": [grid(8, 6, count=2), {"kind": "constant", "colours": colours}],
+        }
+    )
+    assert [end.tolist() for end in made.ends()] == [[3, 5], [2]]
+    assert [end.tolist() for end in made.ends([0, 4, 5])] == [[5], [4]]
+    assert made.black.tolist() == [3, 5]
+
+
 @pytest.mark.parametrize(
     ("parts", "why"),
     [

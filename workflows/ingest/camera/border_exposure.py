@@ -10,6 +10,7 @@ from storage.layout.captures import Stack, Strips
 from workflows.images.integer_formats import Codes
 from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.light.local_gain import Surroundings
+from workflows.ingest.light.stack_attributes import program_of
 from workflows.programs.border import border_light
 from workflows.programs.program import Program
 
@@ -95,7 +96,7 @@ class BorderValues:
         """The values of a stack; None if it is not a film with a border."""
         if not stack.attributes.get("border"):
             return None
-        return cls(stack, Program.model_validate(stack.attributes["program"]))
+        return cls(stack, program_of(stack.attributes))
 
     def __init__(self, stack: Stack, program: Program) -> None:
         strips = strips_of(stack.height, stack.width)

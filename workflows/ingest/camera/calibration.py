@@ -23,7 +23,7 @@ from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.camera.sample import FRAMES, FilmedPixels, HalftoneCodes, Sample
 from workflows.ingest.camera.stated_exposure import automatic_exposures
 from workflows.ingest.light.local_gain import Surroundings, local_gain
-from workflows.ingest.light.measured_light import clipped_from, exposures_of
+from workflows.ingest.light.stack_attributes import clipped_from, exposures_of, program_of
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import NoiseModel, estimate_excess
 from workflows.recovery.camera.photometry import estimate_crosstalk, estimate_noise
@@ -87,7 +87,7 @@ def calibrate(
     tone_mapping : dict, optional
         See `workflows.ingest.trial.tone_mapping`.
     """
-    program = Program.model_validate(stack.attributes["program"])
+    program = program_of(stack.attributes)
     sample = Sample(stack, find_lit(stack, program))
     filmed = sample.every_frame()
     stack.annotate(tone_mapping=tone_mapping, clipped_from=_clipped_from(stack, filmed))

@@ -1,13 +1,14 @@
 """Which pixels see the monitor: the others, of a dark room, tell nothing of the camera or of the glass."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack, thumbnail_edge, thumbnail_mask
 from workflows.images.tone_curves import Curve, to_light
-from workflows.ingest.light.measured_light import exposures_of
+from workflows.ingest.light.stack_attributes import shortest_frames
 from workflows.programs.program import Program
 
 SHARE = 0.03
@@ -27,17 +28,11 @@ def find_lit(stack: Stack, program: Program) -> NDArray[np.bool_]:
     frames that counts, since the border of a film differs between them. Codes of an unknown curve are taken as sRGB.
     """
     every = np.ones((stack.height, stack.width), bool)
-    patterns, exposures = stack.attributes["patterns"], exposures_of(stack.attributes)
-    numbers, sent = program.constants_among(patterns)
-    level = sent.sum(axis=1)
-    black, white = (
-        stack.thumbnails(np.flatnonzero(np.isin(patterns, numbers[level == end]) & (exposures == 1)))
-        for end in (level.min(), level.max())
-    )
+    ends = program.ends(stack.attributes["patterns"])
+    black, white = (stack.thumbnails(shortest_frames(stack.attributes, end)) for end in ends)
     if black is None or white is None or not len(black) or not len(white):
         return every
-    curve: Curve = "linear" if stack.attributes["response"] == "linear" else "srgb"
-    dark, bright = (to_light(part.astype(np.float32) / np.float32(65535), curve) for part in (black, white))
+    dark, bright = (light_of_thumbnails(part, stack.attributes["response"]) for part in (black, white))
     exceeds = bright.min(axis=0) - dark.max(axis=0)
     brightest = np.quantile(exceeds[thumbnail_mask(stack.mask())], BRIGHTEST)
     if brightest <= 0:
@@ -45,6 +40,16 @@ def find_lit(stack: Stack, program: Program) -> NDArray[np.bool_]:
     seen: NDArray[np.bool_] = exceeds > SHARE * brightest
     edge = thumbnail_edge(stack.height, stack.width)
     return seen.repeat(edge, axis=0)[: stack.height].repeat(edge, axis=1)[:, : stack.width]
+
+
+def light_of_thumbnails(codes: NDArray[np.uint16], response: Any) -> NDArray[np.float32]:
+    """The approximate light of some blocks of thumbnails."""
+    return to_light(codes.astype(np.float32) / np.float32(65535), rough_curve(response))
+
+
+def rough_curve(response: Any) -> Curve:
+    """A curve that is close enough to compare light by, of a camera or a monitor."""
+    return "linear" if response == "linear" else "srgb"
 
 
 def windows(seen: NDArray[np.bool_], edge: int) -> list[tuple[slice, slice]]:

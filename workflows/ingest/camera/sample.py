@@ -12,7 +12,7 @@ from workflows.ingest.camera.border_exposure import is_free
 from workflows.ingest.camera.curve import HalfTones, Shown
 from workflows.ingest.camera.lit import windows
 from workflows.ingest.light.local_gain import Surroundings, local_gain
-from workflows.ingest.light.measured_light import exposures_of
+from workflows.ingest.light.stack_attributes import shortest_frames
 from workflows.programs.program import Program
 
 SAMPLES = 20_000
@@ -118,10 +118,9 @@ class HalftoneCodes(NamedTuple):
     @classmethod
     def of(cls, stack: Stack, program: Program, sample: Sample) -> Self | None:
         """Those of a stack; None if the program shows no half-tones, or black or white is missing."""
-        times, patterns = exposures_of(stack.attributes), np.array(stack.attributes["patterns"])
 
         def frames_of(numbers: NDArray[np.intp]) -> NDArray[np.intp]:
-            return np.flatnonzero(np.isin(patterns, numbers) & (times == times.min()))[:FRAMES]
+            return shortest_frames(stack.attributes, numbers)[:FRAMES]
 
         constants, sent = program.constants_among(stack.attributes["patterns"])
         ends = [frames_of(constants[(sent == level).all(axis=1)]) for level in (0, 1)]

@@ -6,20 +6,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from storage.layout.captures import Stack
 from workflows.images.integer_formats import Codes
 from workflows.images.resample import LANCZOS_LOBES, shift_back
-from workflows.images.tone_curves import CameraCurve, Curve, light_of_codes, table, to_light
+from workflows.images.tone_curves import light_of_codes
 from workflows.ingest.light.local_gain import Surroundings
-from workflows.programs.border import border_light
+from workflows.ingest.light.stack_attributes import clipped_from, exposures_of, look_up_of, odd_frames
 from workflows.programs.program import Program
-from workflows.recovery.camera.clipped import bound_clipped
-from workflows.recovery.camera.noise import NoiseModel
 from workflows.recovery.camera.pattern_light import PatternLight
-from workflows.recovery.camera.photometry import Photometry, fit_photometry
-from workflows.recovery.normalise import Conditions
 
 TOUCHED = 0.05
 """A shifted value counts as clipped if clipped values have more than this share of its weights."""
@@ -30,46 +25,10 @@ FrameOf = Callable[[int], tuple[Floats, Bools]]
 """Returns the light of a frame, (n, channels), and whether it is not clipped, by the frame's index."""
 
 
-def clipped_from(stack: Stack) -> int:
-    """The value from which on one counts as clipped: full scale, or less in a film that clips."""
-    return int(stack.attributes.get("clipped_from", np.iinfo(stack.dtype).max))
-
-
-def look_up_of(stack: Stack) -> Floats:
-    """A look-up table from the values of a stack to light, as of `workflows.images.tone_curves.table`."""
-    camera = TypeAdapter[CameraCurve](CameraCurve).validate_python(stack.attributes["camera_curve"])
-    return table(camera, stack.dtype, stack.attributes["storage"]["black"])
-
-
-def monitor_curve_of(attributes: dict[str, Any]) -> Curve:
-    """The monitor's curve, as stated or as calibration has found it."""
-    curve: Curve = TypeAdapter[Curve](Curve).validate_python(attributes["monitor_curve"])
-    return curve
-
-
 def even_out(light: Floats, frame: int, attributes: dict[str, Any]) -> Floats:
     """The light of a frame as in one of usual exposure, if the camera's exposure changed by itself."""
     exposed = attributes.get("auto_exposure")
     return light if exposed is None else light / np.float32(exposed[frame])
-
-
-def exposures_of(attributes: dict[str, Any]) -> Floats:
-    """Exposure times of a stack's frames in units of the shortest, (frames,) float32."""
-    exposures = np.array(attributes["exposures"], np.float32)
-    exposures /= exposures.min()
-    return exposures
-
-
-def odd_frames(attributes: dict[str, Any]) -> list[int]:
-    """The frames of a stack that do not show their patterns, as `workflows.ingest.trial.frame_order` has found."""
-    found: list[int] = attributes.get("odd_frames", [])  # missing from captures of earlier versions
-    return found
-
-
-def patterns_seen(attributes: dict[str, Any]) -> list[int]:
-    """The patterns of a stack's frames, in order, without those of odd ones."""
-    odd = set(odd_frames(attributes))
-    return [pattern for frame, pattern in enumerate(attributes["patterns"]) if frame not in odd]
 
 
 def read_light(
@@ -156,7 +115,7 @@ def light_of(frame_of: FrameOf, attributes: dict[str, Any], program: Program, pi
     light, gain = merge(frame_of, attributes, program.count, pixels)
     values, usable, worth = light
     if gain is not None:
-        black = np.intersect1d(black_patterns(program), attributes["patterns"])
+        black = np.intersect1d(program.black, attributes["patterns"])
         S = values[:, black].mean(axis=1, keepdims=True)
         values = (S + (values - S) / gain).astype(np.float32)
     crosstalk = np.array(attributes["crosstalk"])
@@ -217,78 +176,6 @@ def merge(
         return np.ascontiguousarray(values.transpose(1, 0, 2))
 
     return PatternLight(by_pixel(light), by_pixel(usable), by_pixel(worth)), by_pixel(gain) if gains else None
-
-
-def conditions_of(stack: Stack, program: Program) -> Conditions:
-    """What else than T the frames of a capture show, as far as its ingest found it."""
-    attributes = stack.attributes
-    return Conditions(
-        stack.channels == 1,
-        stray_light(attributes, program),
-        attributes.get("model_error", 0.0),
-    )
-
-
-def stray_light(attributes: dict[str, Any], program: Program) -> Floats:
-    """What changes with the patterns' numbers but is none of their light: the border of a film, seen in the glass.
-
-    Parameters
-    ----------
-    attributes : dict
-        Of the stack.
-    program : Program
-
-    Returns
-    -------
-    (s, m + 2) float32
-        A row of ones, then one row for each bit of the border, of mean 0; columns as of
-        :class:`~workflows.recovery.lobes.footprint.PatternCodes`.
-
-    Notes
-    -----
-    S and S + rho are the ends of a line that is fitted to the constant frames, so the border's light in them is the
-    same linear function of its light in these frames.
-    """
-    shown = program.measured
-    if not attributes.get("border"):
-        return np.ones((1, shown.size + 2), np.float32)
-    border = border_light(range(program.count))
-    numbers, sent = constants_of(attributes, program)
-    slope = np.stack([np.ones(len(numbers)), sent.mean(axis=1)], axis=1)
-    ends = np.array([[1, 0], [1, 1]]) @ np.linalg.pinv(slope)
-    rows = np.concatenate([border[:, shown], border[:, numbers] @ ends.T.astype(np.float32)], axis=1)
-    return np.concatenate([np.ones((1, rows.shape[1]), np.float32), rows])
-
-
-def constants_of(attributes: dict[str, Any], program: Program) -> tuple[NDArray[np.intp], Floats]:
-    """The constant patterns that S and rho are fitted to, and the values sent to the monitor in each.
-
-    Beside a border they are the grey ones, if there are two levels: its bits differ between the frames that are black
-    to one channel and those that are to another, so that `stray_light` would be another in each.
-    """
-    numbers, sent = program.constants_among(attributes["patterns"])
-    grey = np.ptp(sent, axis=1) == 0
-    if attributes.get("border") and np.ptp(sent[grey, :1]) > 0:
-        return numbers[grey], sent[grey]
-    return numbers, sent
-
-
-def observe(
-    light: PatternLight, attributes: dict[str, Any], program: Program, monitor: Curve
-) -> tuple[Photometry, PatternLight]:
-    """Fit S and rho to what pixels saw of constant patterns, and bound what is clipped of those that are measured."""
-    noise = NoiseModel(**attributes["noise"])
-    numbers, sent = constants_of(attributes, program)
-    photometry = fit_photometry(light.of_patterns(numbers), to_light(sent, monitor), noise)
-    shown = program.measured
-    filmed = np.isin(shown, patterns_seen(attributes))
-    return photometry, bound_clipped(light.of_patterns(shown), filmed, photometry, noise)
-
-
-def black_patterns(program: Program) -> NDArray[np.intp]:
-    """The numbers of the constant patterns that are black."""
-    numbers, sent = program.constants
-    return numbers[~sent.any(axis=1)]
 
 
 def margin_of(shifts: Sequence[Sequence[float]]) -> int:

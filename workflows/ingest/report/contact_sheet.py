@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import from_light, light_of_codes
-from workflows.ingest.light.measured_light import look_up_of
+from workflows.ingest.light.stack_attributes import look_up_of, program_of
 from workflows.interruption import checkpoint
 from workflows.programs.program import Program
 
@@ -37,7 +37,7 @@ def contact_sheet(stack: Stack) -> bytes:
     bytes
         A PNG. A thumbnail's pixel is red where any value in it is clipped at white, and blue where at black.
     """
-    program = Program.model_validate(stack.attributes["program"])
+    program = program_of(stack.attributes)
     picked = _pick(stack, program)
     light, high, low = _shrink(stack, [frame for frame, _ in picked])
     height, width = light.shape[1:3]
@@ -59,7 +59,7 @@ def contact_sheet(stack: Stack) -> bytes:
 
 def thumbnail(stack: Stack) -> bytes:
     """Draw the brightest constant frame, which shows the object best; returns a PNG."""
-    picked = _pick(stack, Program.model_validate(stack.attributes["program"]))
+    picked = _pick(stack, program_of(stack.attributes))
     frame = next((frame for frame, caption in picked if caption.endswith("brightest")), 0)
     light, _, _ = _shrink(stack, [frame])
     return _png(Image.fromarray(_codes(light[0])))
@@ -86,11 +86,8 @@ def bytes_of_contact_sheet(stack: Stack) -> int:
 
 def _pick(stack: Stack, program: Program) -> list[tuple[int, str]]:
     """The frames to show, and their captions."""
-    numbers, sent = program.constants
-    chosen = {
-        int(numbers[np.argmin(sent.sum(axis=1))]): "darkest",
-        int(numbers[np.argmax(sent.sum(axis=1))]): "brightest",
-    }
+    darkest, brightest = program.ends()
+    chosen = {int(darkest[0]): "darkest", int(brightest[0]): "brightest"}
     patterned = [
         (part, start, end)
         for part, (start, end) in zip(program.parts, pairwise(program.starts), strict=True)

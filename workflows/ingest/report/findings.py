@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from workflows.ingest.camera.border_exposure import is_free
-from workflows.ingest.light.measured_light import patterns_seen
+from workflows.ingest.light.stack_attributes import patterns_seen
 from workflows.ingest.report.expected_psnr import costs_of, model_error_of
 from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
 from workflows.ingest.report.frame_findings import constants, frames, named, odd_frames, order

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from workflows.ingest.light.measured_light import patterns_seen
+from workflows.ingest.light.stack_attributes import patterns_seen, program_of
 from workflows.ingest.report.expected_psnr import expected, left_of, model_error_of
 from workflows.ingest.report.figures import (
     LEVELS,
@@ -19,7 +19,6 @@ from workflows.ingest.report.figures import (
 )
 from workflows.ingest.report.findings import findings
 from workflows.ingest.report.limits import is_blown
-from workflows.programs.program import Program
 
 
 class Report(Figures):
@@ -39,7 +38,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
     frames : int
         Number of frames in the stack.
     """
-    program = Program.model_validate(attributes["program"])
+    program = program_of(attributes)
     quality = None
     if not attributes.get("order") and not is_blown(attributes["survey"]):
         quality = expected(

@@ -15,7 +15,13 @@ from workflows.ingest.camera.border_exposure import BorderValues, is_free, short
 from workflows.ingest.camera.calibration import calibrate, constant_frames
 from workflows.ingest.camera.lit import find_lit, windows
 from workflows.ingest.light.local_gain import local_gain
-from workflows.ingest.light.measured_light import clipped_from, even_out, exposures_of, look_up_of
+from workflows.ingest.light.measured_light import even_out
+from workflows.ingest.light.stack_attributes import (
+    clipped_from,
+    look_up_of,
+    program_of,
+    shortest_frames,
+)
 from workflows.ingest.report.colour_detail import ColourDetail
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import NoiseModel
@@ -49,7 +55,7 @@ def survey(stack: Stack, border: BorderValues | None = None) -> None:
         calibrate(stack, border, stack.attributes["gains"], stack.attributes["tone_mapping"])
         if stack.attributes["noise_of_patterns"]:
             stack.annotate(noise=noise)
-    program = Program.model_validate(stack.attributes["program"])
+    program = program_of(stack.attributes)
     frames = _Frames.of(stack, program)
     seen, found = find_lit(stack, program), _Windows(stack, frames)
     for rows, columns in windows(seen, EDGE):
@@ -188,8 +194,7 @@ class _Windows:
 
 def _halftone_frames(stack: Stack, program: Program) -> list[tuple[int, float]]:
     """A frame of each half-tone in the shortest exposure, and the share of white's light that it should have."""
-    patterns, times = np.array(stack.attributes["patterns"]), exposures_of(stack.attributes)
-    frames = [np.flatnonzero((patterns == n) & (times == times.min())) for n in program.halftones[0]]
+    frames = [shortest_frames(stack.attributes, number) for number in program.halftones[0]]
     return [
         (int(found[0]), float(level))
         for found, level in zip(frames, program.halftones[1], strict=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from workflows.ingest.light.measured_light import exposures_of, odd_frames
+from workflows.ingest.light.stack_attributes import exposures_of, odd_frames
 from workflows.ingest.pixel_sample import Doubles, PixelSample
 from workflows.ingest.trial.frame_order import MOST_ODD
 from workflows.ingest.trial.trial_recovery import Calibrated, RecoveredSample, predict, recover_seen

@@ -8,7 +8,7 @@ from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderLight, BorderValues, is_free
 from workflows.ingest.camera.calibration import calibrate
 from workflows.ingest.light.local_gain import local_gain
-from workflows.ingest.light.measured_light import look_up_of, monitor_curve_of
+from workflows.ingest.light.stack_attributes import look_up_of, monitor_curve_of
 from workflows.ingest.pixel_sample import PixelSample, take_sample
 from workflows.ingest.trial.covered import find_covered
 from workflows.ingest.trial.tone_mapping import find_tone_mapping

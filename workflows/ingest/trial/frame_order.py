@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,9 @@ from scipy.ndimage import binary_dilation
 
 from storage.layout.captures import Stack, thumbnail_edge, thumbnail_mask
 from workflows.images.resample import area_mean
-from workflows.images.tone_curves import Curve, to_light
 from workflows.ingest.camera.border_exposure import BorderValues
-from workflows.ingest.light.measured_light import exposures_of
+from workflows.ingest.camera.lit import light_of_thumbnails, rough_curve
+from workflows.ingest.light.stack_attributes import exposures_of, program_of
 from workflows.ingest.video.resemblance import GRIDS, MIN_PATTERNS, coarse_light
 from workflows.programs.parts import Bernoulli
 from workflows.programs.program import Program
@@ -106,7 +106,7 @@ def check_frames(stack: Stack, border: BorderValues | None) -> None:
     cells. A wrong order fits some cell by chance: orders are compared by how much like its own pattern each frame is.
     """
     stack.annotate(odd_frames=[], order=None, constants_apart=None)
-    program = Program.model_validate(stack.attributes["program"])
+    program = program_of(stack.attributes)
     light = _light_of(stack, border)
     if light is None:
         return
@@ -121,7 +121,7 @@ def check_frames(stack: Stack, border: BorderValues | None) -> None:
     parts = _random_parts(patterns, program)
     if not parts:
         return
-    cells = _cells(coarse_light(program, _curve(program.monitor.response), stack.images()))
+    cells = _cells(coarse_light(program, rough_curve(program.monitor.response), stack.images()))
     found = find_order(seen, patterns, cells, parts)
     if found is not None:
         stack.annotate(order=found._replace(first=int(frames[found.first]))._asdict())
@@ -221,11 +221,7 @@ def _unit(values: Floats, axis: int) -> Floats:
 
 def _ends(patterns: Integers, program: Program) -> tuple[Integers, Integers] | None:
     """The frames of the darkest and of the brightest constants; None if there are none of either."""
-    numbers, sent = program.constants
-    level = sent.sum(axis=1)
-    dark, bright = (
-        np.flatnonzero(np.isin(patterns, numbers[level == end])) for end in (level.min(), level.max())
-    )
+    dark, bright = (np.flatnonzero(np.isin(patterns, end)) for end in program.ends())
     return (dark, bright) if len(dark) and len(bright) else None
 
 
@@ -257,18 +253,13 @@ def _light_of(stack: Stack, border: BorderValues | None) -> Floats | None:
         of_border[tuple(border.places // thumbnail_edge(stack.height, stack.width))] = True
         wanted &= ~binary_dilation(of_border, np.ones((3, 3), bool))  # those beside see a part of it
     codes = thumbnails[:, wanted]
-    light = to_light(codes.astype(np.float32) / np.float32(65535), _curve(stack.attributes["response"]))
+    light = light_of_thumbnails(codes, stack.attributes["response"])
     changes = light.std(axis=0)
     light = light[:, changes > CHANGES * np.quantile(changes, BRIGHTEST)]
     if light.shape[1] < FEWEST:
         return None
     chosen = np.unique(np.linspace(0, light.shape[1] - 1, PLACES).astype(int))
     return light[:, chosen]
-
-
-def _curve(response: Any) -> Curve:
-    """A curve that is close enough to compare light by."""
-    return "linear" if response == "linear" else "srgb"
 
 
 def _random_parts(patterns: Integers, program: Program) -> list[Integers]:

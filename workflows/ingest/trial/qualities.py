@@ -10,7 +10,7 @@ from numba.core.event import install_recorder
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
-from workflows.ingest.light.measured_light import monitor_curve_of
+from workflows.ingest.light.stack_attributes import monitor_curve_of, program_of
 from workflows.ingest.pixel_sample import PixelSample, Seen, see_sample
 from workflows.ingest.trial.trial_recovery import Calibrated, RecoveredSample, recover_seen
 from workflows.programs.parts import Bernoulli
@@ -85,7 +85,7 @@ def try_qualities(stack: Stack, sample: PixelSample, patterns: Patterns) -> dict
     often have half of the core. Reading the frames and writing the matte are left out.
     """
     attributes = stack.attributes
-    program = Program.model_validate(attributes["program"])
+    program = program_of(attributes)
     capture = Calibrated(stack, program, monitor_curve_of(attributes))
     shifts, gains = np.zeros((stack.frames, 2)), np.zeros(stack.frames)
     if attributes["shifts"] is not None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderValues, is_free
-from workflows.ingest.light.measured_light import black_patterns
+from workflows.ingest.light.stack_attributes import program_of
 from workflows.ingest.pixel_sample import Doubles, PixelSample
 from workflows.ingest.trial.explanation import explain
 from workflows.ingest.trial.search import Found, Search, are_within, size_of, usual_error
@@ -89,7 +89,7 @@ def find_steadiness(
         pattern_error=None,
         noise_of_patterns=False,
     )
-    program = Program.model_validate(stack.attributes["program"])
+    program = program_of(stack.attributes)
     if sample is None:
         return None
     explained = explain(stack, program, sample, border)
@@ -103,7 +103,7 @@ def find_steadiness(
     if np.count_nonzero(np.isfinite(at_rest.off[shown]).all(axis=1)) < MIN_FRAMES:
         return through
     try_out = partial(try_recovery, capture, through, sample)
-    first, has_black = at_rest, bool(np.isin(black_patterns(program), patterns).any())
+    first, has_black = at_rest, bool(np.isin(program.black, patterns).any())
     free = is_free(stack.attributes["auto_exposure"])
     if free:
         begin[shown, 2] = find_white_excess(capture, light, wide)
@@ -113,9 +113,7 @@ def find_steadiness(
     found = Search(try_out, begin, shown, has_black and not free).run(first, at_rest.residual)
     corrected = found.to_correct(begin)
     gains = np.exp(corrected[:, 2] - (0 if free else np.median(corrected[shown, 2])))
-    numbers, sent = program.constants
-    level = sent.sum(axis=1)
-    white = np.isin(patterns, numbers[level == level.max()]) & np.isfinite(found.trial.off[:, 2])
+    white = np.isin(patterns, program.ends()[1]) & np.isfinite(found.trial.off[:, 2])
     bright = _brightness(light, program, patterns[shown])
     figures = _figures(found, shown, white, bright) if found.is_known else {}
     stack.annotate(

@@ -8,12 +8,9 @@ from numpy.typing import NDArray
 
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import Curve, to_light
-from workflows.ingest.light.measured_light import (
-    conditions_of,
-    exposures_of,
-    light_of,
-    observe,
-)
+from workflows.ingest.light.measured_light import light_of
+from workflows.ingest.light.observation import conditions_of, observe
+from workflows.ingest.light.stack_attributes import exposures_of
 from workflows.ingest.pixel_sample import MIN_PIXELS, Doubles, Floats, PixelSample, Seen, see_sample
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import MEDIAN_TO_SIGMA, NoiseModel

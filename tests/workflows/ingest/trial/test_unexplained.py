@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from storage.layout.captures import Stack
 from tests.parts.captures import captured, nested_program
 from workflows.images.tone_curves import to_light
-from workflows.ingest.light.measured_light import monitor_curve_of
+from workflows.ingest.light.stack_attributes import monitor_curve_of
 from workflows.ingest.pixel_sample import take_sample
 from workflows.ingest.report.expected_psnr import model_error_of
 from workflows.ingest.report.report import report
