@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from workflows.ingest.pixel_sample import FURTHEST, Doubles
 from workflows.ingest.trial.movement import smooth_path
-from workflows.ingest.trial.trial_recovery import Trial
+from workflows.ingest.trial.trial_recovery import WHITE_APART, Trial
 
 ROUNDS = 10
 """Rounds of measuring and correcting, at most."""
@@ -16,8 +16,6 @@ SETTLED = (0.003, 0.0005)
 """Rounds end when shifts, in pixels, and gains change less than this, root mean square."""
 MIN_DRIFT, MIN_FLICKER = 0.01, 0.003
 """Drift (root mean square, pixels) and flicker (standard deviation of the gain) below these are not corrected."""
-MIN_APART = 0.02
-"""Nor are gains of constant frames that differ by less from those of patterns, as they do by errors of curves."""
 TRIFLE = 0.5
 """The first trial sees only part of a disturbance: more rounds follow if it finds this share of `MIN_DRIFT` or
 `MIN_FLICKER`,"""
@@ -91,27 +89,24 @@ class Search(NamedTuple):
 
     def run(self, first: Trial, residual: float) -> Found:
         """Search, given the trial of the beginning, and the residual without shifts and gains."""
-        found, last = self.begin + _fill_gaps(first, self.shown), first
-        moves = flickers = False
-        believed = np.ones(2, bool)
-        least = np.array([MIN_DRIFT, MIN_FLICKER])
-        size, error = sizes_of(found - self.begin, first, self.shown)
-        if ((size > TRIFLE * least) & (size > LOOK_AGAIN * error)).any():
-            found, last, left = self.settle(first)
-            size, error = sizes_of(found - self.begin, last, self.shown)
-            there = (size >= least) & (size >= SURE * error)
-            sure = (
-                there & (sizes_of(left, last, self.shown)[0] <= REST * size) & are_within(found, self.shown)
-            )
-            believed = are_believed(residual, last.residual)
-            moves = bool(sure[0] and believed[0])
-            # Movement that is not a common shift looks like flicker.
-            flickers = bool(sure[1] and believed[1] and self.with_gains and (moves or not there[0]))
+        at_first, least = self.begin + _fill_gaps(first, self.shown), np.array([MIN_DRIFT, MIN_FLICKER])
+        size, error = sizes_of(at_first - self.begin, first, self.shown)
+        if not ((size > TRIFLE * least) & (size > LOOK_AGAIN * error)).any():
+            is_known = bool(first.residual <= EXPLAINED[0])
+            return Found(at_first, first, moves=False, flickers=False, is_known=is_known)
+        found, last, left = self.settle(first)
+        size, error = sizes_of(found - self.begin, last, self.shown)
+        there = (size >= least) & (size >= SURE * error)
+        sure = there & (sizes_of(left, last, self.shown)[0] <= REST * size) & are_within(found, self.shown)
+        believed = are_believed(residual, last.residual)
+        moves = bool(sure[0] and believed[0])
+        # Movement that is not a common shift looks like flicker.
+        flickers = bool(sure[1] and believed[1] and self.with_gains and (moves or not there[0]))
         if moves or flickers:
             return Found(found, last, moves, flickers, is_known=True)
-        is_known = last.residual <= EXPLAINED[0] and (last is first or bool(believed.any()))
+        is_known = bool(last.residual <= EXPLAINED[0] and believed.any())
         # The first trial underestimates, but later rounds may have diverged.
-        return Found(self.begin + _fill_gaps(first, self.shown), first, moves, flickers, is_known)
+        return Found(at_first, first, moves, flickers, is_known)
 
     def settle(self, trial: Trial) -> tuple[Doubles, Trial, Doubles]:
         """Correct and measure again, from the trial of the beginning, until little is left; returns what was found,
@@ -209,7 +204,8 @@ def sizes_of(found: Doubles, trial: Trial, shown: NDArray[np.bool_]) -> tuple[Do
 
 
 def constants_apart(found: Doubles, trial: Trial, shown: NDArray[np.bool_]) -> float:
-    """By how much gains of constant frames differ from the mean of patterns', root mean square; 0 below `MIN_APART`.
+    """By how much gains of constant frames differ from the mean of patterns', root mean square; 0 below
+    `WHITE_APART`.
 
     All patterns are about as bright as each other, and white is twice as bright. So a monitor that limits its
     brightness, or an exposure that is not locked, may differ between white and patterns alone.
@@ -218,7 +214,7 @@ def constants_apart(found: Doubles, trial: Trial, shown: NDArray[np.bool_]) -> f
     if not constant.any():
         return 0.0
     apart = size_of((found[constant, 2] - found[shown, 2].mean())[:, np.newaxis])
-    return apart if apart >= MIN_APART else 0.0
+    return apart if apart >= WHITE_APART else 0.0
 
 
 def usual_error(errors: Doubles) -> float:

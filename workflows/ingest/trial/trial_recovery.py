@@ -30,6 +30,9 @@ HUBER, REWEIGHTED = 1.5, 6
 """Standard deviations beyond which a value gets less weight, and how often weights are updated."""
 OUTLIER = 9.0
 """The most that one value adds to a residual."""
+WHITE_APART = 0.02
+"""Share of the light from which on white frames differ from what is white in patterns, as before a monitor that limits
+its brightness. Glare and errors of curves make less. The report tells of `workflows.ingest.report.findings.DIMMED`."""
 
 
 class Calibrated(NamedTuple):

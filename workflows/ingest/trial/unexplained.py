@@ -6,7 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflows.ingest.pixel_sample import Doubles, Floats, PixelSample
-from workflows.ingest.trial.trial_recovery import Calibrated, RecoveredSample, predict, recover_sample
+from workflows.ingest.trial.trial_recovery import (
+    WHITE_APART,
+    Calibrated,
+    RecoveredSample,
+    predict,
+    recover_sample,
+)
 from workflows.recovery.camera.noise import LEAST_READ, NoiseModel, fit_noise
 from workflows.recovery.glare import LEAST, Spread, centres, filter_patterns, fit_shares, spread_patterns
 from workflows.recovery.normalise import normalise
@@ -35,8 +41,6 @@ MOST_GLARE = 0.7
 """A larger share of the light is no glare: the sample sees something else, such as mostly the border of a film."""
 HIDDEN = 1.5
 """Ratio of the variance of patterns to that of constant frames from which these hide noise."""
-BRIGHTER = 0.04
-"""In units of T, 2 % of the light: less than that is due to glare, and to curves that are not quite right."""
 MIN_FLAT = 120
 """Values that the noise and the error of the model are measured from, at least."""
 CONTRAST = 3.0
@@ -182,57 +186,72 @@ class Rest:
 
     def pattern_error(self) -> float:
         """Root mean square of the residuals, in camera units."""
-        return float(np.sqrt(np.mean((self.rest[self.known] * self.rho[self.known] / 2) ** 2)))
+        return float(np.sqrt(np.mean(self._squares(self.known))))
 
     def noise_and_error(self, noise: NoiseModel, assumed: bool) -> tuple[NoiseModel, float]:
         """The noise of a frame and the error of the model.
 
-        The noise of constant frames, unless it is only assumed, is kept if that of patterns is about the same. JPEG and
-        noise reduction hide noise where a picture is flat.
+        Of three channels, what each and the next one have in common is the error. Of one channel the error is what is
+        left beside the noise, or nothing where that is only assumed.
         """
-        if np.count_nonzero(self.flat) < MIN_FLAT:
+        flat, in_colour = self.flat, self.rest.shape[1] == 3
+        if in_colour:
+            flat = flat & np.roll(flat, -1, axis=1)
+        if np.count_nonzero(flat) < MIN_FLAT:
             return noise, 0.0
-        if self.rest.shape[1] == 3:
-            flat = self.flat & np.roll(self.flat, -1, axis=1)
-            if np.count_nonzero(flat) < MIN_FLAT:
-                return noise, 0.0
-            own, other = self.rest[flat], np.roll(self.rest, -1, axis=1)[flat]
-            common = _mean_without_outliers(own * other)
-            # Under patterns in colour a channel may see white, and the next one black.
-            lit = (self.plain > 0).astype(np.float32)
-            apart = own - other - self._brighter() * (lit - np.roll(lit, -1, axis=1))[flat]
-            # The variance of a difference, in units of T, is the sum of two: that of a frame over rho squared of each.
-            rho, of_other = self.rho[flat] ** 2, np.roll(self.rho, -1, axis=1)[flat] ** 2
-            square = apart**2 / 4 * rho * of_other / (rho + of_other)
+        if in_colour:
+            common, square = self._pairs(flat)
+            noise = self._noise(flat, square, noise, assumed)
+        elif assumed:
+            common, noise = 0.0, self._noise(flat, self._squares(flat), noise, assumed)
         else:
-            flat = self.flat
-            square = (self.rest[flat] / 2 * self.rho[flat]) ** 2
-            common = 0.0 if assumed else _mean_without_outliers(self.rest[flat] ** 2)
-            common -= 0.0 if assumed else float(self.variance[flat].mean())
-        if assumed or self.rest.shape[1] == 3:
-            level, square = (
-                self.level[flat].astype(np.float64),
-                (square * self.worth[flat]).astype(np.float64),
-            )
-            floor = max(noise.read / 100, LEAST_READ)
-            found = fit_noise(level, square, floor) or noise
-            if assumed or found.variance(_GREY)[0] > HIDDEN * noise.variance(_GREY)[0]:
-                noise = found
-            elif self.filmed:
-                # Exposures and local tone mapping that are not quite right widen what a film shows beyond black and
-                # white, which its noise was measured by. All that is left is an upper limit.
-                square = (self.rest[flat] / 2 * self.rho[flat]) ** 2 * self.worth[flat]
-                limit = fit_noise(level, square.astype(np.float64), floor)
-                if limit and limit.variance(_GREY)[0] < noise.variance(_GREY)[0]:
-                    noise = limit
+            common = _mean_without_outliers(self.rest[flat] ** 2) - float(self.variance[flat].mean())
         error = float(np.sqrt(max(common, 0.0)) / 2)
         return noise, error if error >= LEAST_ERROR else 0.0
 
+    def _squares(self, at: NDArray[np.bool_]) -> NDArray[np.floating]:
+        """The squares of some residuals, in camera units."""
+        squares: NDArray[np.floating] = (self.rest[at] / 2 * self.rho[at]) ** 2
+        return squares
+
+    def _pairs(self, flat: NDArray[np.bool_]) -> tuple[float, NDArray[np.floating]]:
+        """What each channel and the next one have in common, a mean square in units of T, and what sets them apart: the
+        squared errors of a frame, in camera units.
+        """
+        own, other = self.rest[flat], np.roll(self.rest, -1, axis=1)[flat]
+        # Under patterns in colour a channel may see white, and the next one black.
+        lit = (self.plain > 0).astype(np.float32)
+        apart = own - other - self._brighter() * (lit - np.roll(lit, -1, axis=1))[flat]
+        # The variance of a difference, in units of T, is the sum of two: that of a frame over rho squared of each.
+        rho, of_other = self.rho[flat] ** 2, np.roll(self.rho, -1, axis=1)[flat] ** 2
+        return _mean_without_outliers(own * other), apart**2 / 4 * rho * of_other / (rho + of_other)
+
+    def _noise(
+        self, flat: NDArray[np.bool_], square: NDArray[np.floating], noise: NoiseModel, assumed: bool
+    ) -> NoiseModel:
+        """The noise of a frame by squared errors of patterns.
+
+        That of constant frames, unless it is only assumed, is kept if it is about the same. JPEG and noise reduction
+        hide noise where a picture is flat.
+        """
+        level, floor = self.level[flat].astype(np.float64), max(noise.read / 100, LEAST_READ)
+
+        def fitted(square: NDArray[np.floating]) -> NoiseModel | None:
+            return fit_noise(level, (square * self.worth[flat]).astype(np.float64), floor)
+
+        found = fitted(square) or noise
+        if assumed or found.variance(_GREY)[0] > HIDDEN * noise.variance(_GREY)[0]:
+            return found
+        # Exposures and local tone mapping that are not quite right widen what a film shows beyond black and white,
+        # which its noise was measured by. All that is left is an upper limit.
+        limit = fitted(self._squares(flat)) if self.filmed else None
+        return limit if limit and limit.variance(_GREY)[0] < noise.variance(_GREY)[0] else noise
+
     def _brighter(self) -> float:
-        """By how much what is white in patterns is brighter than white frames; 0 below `BRIGHTER`."""
+        """By how much what is white in patterns is brighter than white frames, in units of T; 0 if by a trifle."""
         white = self.rest[self.flat & (self.plain > 0)]
         more = float(np.median(white)) if white.size else 0.0
-        return more if abs(more) >= BRIGHTER else 0.0
+        return more if abs(more) >= 2 * WHITE_APART else 0.0
 
     def smooth_error(self, sample: PixelSample, otherwise: float) -> float:
         """The error of the model in a film by pixels above each other, where both see a pattern alike."""
