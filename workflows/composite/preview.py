@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from workflows.composite.engine import Window
 from workflows.composite.strips import Blocks
+from workflows.images.resample import between_samples
 
 
 def window_of_preview(window: Window, spacing: int, width: int, height: int) -> Window:
@@ -80,6 +81,4 @@ def _between(
     at: NDArray[np.integer], spacing: int, size: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
     """The pixels of a preview before and after places along an axis of the frame, and the share of the latter."""
-    place = np.clip((at - spacing // 2) / spacing, 0, size - 1)
-    before = np.floor(place).astype(np.intp)
-    return before, np.minimum(before + 1, size - 1), (place - before).astype(np.float32)
+    return between_samples((at - spacing // 2) / spacing, size)

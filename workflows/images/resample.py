@@ -134,6 +134,24 @@ def stretched_mean(
     return values
 
 
+def between_samples(
+    place: NDArray[np.floating], size: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+    """The samples of a row before and after each place, and the share of the latter, for linear interpolation.
+
+    Beyond its ends the row of ``size`` samples goes on as the first and the last of them.
+
+    Examples
+    --------
+    >>> before, after, share = between_samples(np.array([-3, 0.25, 2]), 3)
+    >>> before.tolist(), after.tolist(), share.tolist()
+    ([0, 0, 2], [1, 1, 2], [0.0, 0.25, 0.0])
+    """
+    place = np.clip(place, 0, size - 1)
+    before = np.floor(place).astype(np.intp)
+    return before, np.minimum(before + 1, size - 1), (place - before).astype(np.float32)
+
+
 def shift_back(
     values: NDArray[np.float32], shift: Sequence[float], margin: int, *, magnitude: bool = False
 ) -> NDArray[np.float32]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.layout.captures import Stack, thumbnail_edge
+from workflows.images.resample import between_samples
 
 DARK = 0.05
 """Brightness below which a camera brightens hardly further."""
@@ -37,7 +38,8 @@ class Surroundings(NamedTuple):
         """
         rows, columns = self.values.shape[1:]
         (top, bottom, down), (left, right, across) = (
-            _between(place, self.edge, size) for place, size in ((y, rows), (x, columns))
+            between_samples((place + 0.5) / self.edge - 0.5, size)
+            for place, size in ((y, rows), (x, columns))
         )
         of_frames = self.values[frames]
         upper, lower = (
@@ -87,10 +89,3 @@ def local_gain(stack: Stack) -> Surroundings | None:
     return near._replace(
         values=np.exp(np.float32(-found["power"]) * (near.values - np.float32(found["usual"])))
     )
-
-
-def _between(place: Places, edge: int, blocks: int) -> tuple[Places, Places, Floats]:
-    """The blocks whose centres are before and after each place, and the share of the latter."""
-    at = np.clip((place + 0.5) / edge - 0.5, 0, blocks - 1)
-    before = np.floor(at).astype(np.intp)
-    return before, np.minimum(before + 1, blocks - 1), (at - before).astype(np.float32)
