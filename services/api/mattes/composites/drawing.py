@@ -16,9 +16,10 @@ from workflows.composite import composite, light_on
 from workflows.composite.backdrops.around import expose, put_around
 from workflows.composite.backdrops.backdrop import Backdrop
 from workflows.composite.depth import Rays, from_one, from_two
-from workflows.composite.engine import Window, compose, double, shrink
+from workflows.composite.engine import Window, compose
 from workflows.composite.interval import contrast_on, half_widths
 from workflows.composite.preview import enlarge, put_behind, window_of_preview
+from workflows.composite.scale import double, shrink
 from workflows.composite.strips import Strip
 from workflows.recovery.interval import Interval
 from workflows.threads import CORES
