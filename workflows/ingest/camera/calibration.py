@@ -10,15 +10,14 @@ from pydantic import TypeAdapter
 from storage.layout.captures import Stack
 from workflows.images.tone_curves import (
     CameraCurve,
-    Estimate,
     Response,
-    estimate,
     light_of_codes,
     table,
     to_light,
 )
 from workflows.ingest.camera.border_exposure import TRIFLE, BorderValues, is_free, relative_to_white
 from workflows.ingest.camera.curve import are_scaled, fit_camera_curve
+from workflows.ingest.camera.curve_estimate import Estimate, estimate
 from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.camera.sample import FRAMES, FilmedPixels, HalftoneCodes, Sample
 from workflows.ingest.camera.stated_exposure import automatic_exposures
