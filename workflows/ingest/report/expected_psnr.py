@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from workflows.ingest.light.stack_attributes import patterns_seen
 from workflows.ingest.report.figures import Quality
 from workflows.programs.parts import Bernoulli, Constant, Halftone
 from workflows.programs.program import Program
@@ -45,32 +46,14 @@ _LOW = _End(k=19.0, c=0.0093, d=0.9, a=0.45, b=1.2, others=3.0, model=1.0, left=
 _HIGH = _End(k=5.5, c=0.00014, d=0.6, a=0.00045, b=0.35, others=-5.0, model=0.5, left=0.25, in_colour=0.5)
 
 
-def expected(
-    program: Program,
-    patterns: Sequence[int],
-    survey: dict[str, Any],
-    model_error: float,
-    pattern_error: float | None = None,
-    exposures: Sequence[float] | None = None,
-    left: float = 0.0,
-) -> Quality | None:
+def expected(program: Program, attributes: dict[str, Any]) -> Quality | None:
     """Predict the PSNR of composites from the noise, the contrast, and the program's patterns.
 
     Parameters
     ----------
     program : Program
-    patterns : sequence of int
-        The patterns that have frames.
-    survey : dict
-        See `workflows.ingest.report.survey`.
-    model_error : float
-        See `model_error_of`.
-    pattern_error : float, optional
-        See there, in camera units.
-    exposures : sequence of float, optional
-        Of each frame, if the camera's changed by itself.
-    left : float
-        See `left_of`.
+    attributes : dict
+        Of the stack, after `survey`.
 
     Returns
     -------
@@ -113,8 +96,9 @@ def expected(
     outside the range; of 15 of them that were made afterwards, 1. All 7 are below it, and 5 to 12 dB better after the
     best exposure and colours, which no capture tells.
     """
+    survey, patterns, costs = attributes["survey"], patterns_seen(attributes), costs_of(program, attributes)
     rho, s2 = survey["contrast"], survey["deviation"] ** 2
-    costs = costs_of(program, patterns, survey, model_error, exposures)
+    pattern_error, left = attributes.get("pattern_error"), left_of(program, attributes)
     lost_colours = program.in_colour and costs["lost_colour"] > 0
     counts, _ = np.histogram(np.unique(patterns), program.starts)
     shown = [
@@ -131,7 +115,7 @@ def expected(
     fixed = not any(part.offset for part in random)
     measured = sum(count for part, count in shown if fixed or not isinstance(part, Bernoulli) or part.offset)
     blocks = max(min(part.columns, part.rows) for part in random) if fixed else None
-    model = costs["model_error"], min(costs["model_error"], beside_noise(survey, pattern_error))
+    model = costs["model_error"], min(costs["model_error"], beside_noise(attributes))
     exposed = 0.0, 0.0
     if costs["auto_exposure"]:
         exposed = BACKDROP * (UNKNOWN_EXPOSURE * rho) ** 2, costs["auto_exposure"] / 4
@@ -152,9 +136,10 @@ def model_error_of(attributes: dict[str, Any]) -> float:
     return float(attributes.get("smooth_error", attributes.get("model_error", 0.0)))
 
 
-def beside_noise(survey: dict[str, Any], pattern_error: float | None) -> float:
+def beside_noise(attributes: dict[str, Any]) -> float:
     """The mean square of what patterns show beside T and noise; infinity if it is not known."""
-    return np.inf if pattern_error is None else max(pattern_error**2 - survey["deviation"] ** 2, 0.0)
+    error = attributes.get("pattern_error")
+    return np.inf if error is None else max(error**2 - attributes["survey"]["deviation"] ** 2, 0.0)
 
 
 def left_of(program: Program, attributes: dict[str, Any]) -> float:
@@ -170,13 +155,7 @@ def left_of(program: Program, attributes: dict[str, Any]) -> float:
     return float(max(error**2 - known, 0.0))
 
 
-def costs_of(
-    program: Program,
-    patterns: Sequence[int],
-    survey: dict[str, Any],
-    model_error: float,
-    exposures: Sequence[float] | None,
-) -> dict[str, float]:
+def costs_of(program: Program, attributes: dict[str, Any]) -> dict[str, float]:
     """The mean square errors of composites by their causes, as far as these are known; see :func:`expected`.
 
     Returns
@@ -184,12 +163,13 @@ def costs_of(
     dict
         ``noise``, at the low end; ``model_error``, ``lost_colour``, ``auto_exposure``.
     """
+    survey, measured = attributes["survey"], np.isin(program.measured, patterns_seen(attributes)).sum()
     rho = survey["contrast"]
     return {
-        "noise": _LOW.k * survey["deviation"] ** 2 / max(np.isin(program.measured, patterns).sum(), 1),
-        "model_error": (model_error * rho) ** 2,
+        "noise": _LOW.k * survey["deviation"] ** 2 / max(measured, 1),
+        "model_error": (model_error_of(attributes) * rho) ** 2,
         "lost_colour": survey.get("lost_colour", 0.0),
-        "auto_exposure": exposure_error(exposures) * rho**2,
+        "auto_exposure": exposure_error(attributes.get("auto_exposure")) * rho**2,
     }
 
 

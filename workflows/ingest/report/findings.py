@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from workflows.ingest.camera.border_exposure import is_free
-from workflows.ingest.light.stack_attributes import patterns_seen
 from workflows.ingest.report.expected_psnr import costs_of, model_error_of
 from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
 from workflows.ingest.report.frame_findings import constants, frames, named, odd_frames, order
@@ -38,14 +37,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     cost most when measured (`tests.benchmarks.recovery.devices`): exposure, the camera's own processing, movement,
     scaled patterns, curves, glare, colours.
     """
-    survey = attributes["survey"]
-    costs = costs_of(
-        program,
-        patterns_seen(attributes),
-        survey,
-        model_error_of(attributes),
-        attributes.get("auto_exposure"),
-    )
+    survey, costs = attributes["survey"], costs_of(program, attributes)
     files = attributes.get("files")  # missing from films, and captures of earlier versions
     if attributes.get("order"):  # what else would be found means nothing
         return [order(**attributes["order"], files=files), frames(figures)]

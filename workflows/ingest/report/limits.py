@@ -242,7 +242,7 @@ def is_assumed(attributes: dict[str, Any]) -> bool:
 
 def is_steady_enough(attributes: dict[str, Any]) -> bool:
     """Whether patterns show so little beside T and noise that no movement or flicker among it can show."""
-    return beside_noise(attributes["survey"], attributes.get("pattern_error")) < SHOWS
+    return beside_noise(attributes) < SHOWS
 
 
 def lock_exposure(*, filmed: bool) -> str:

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from workflows.ingest.light.stack_attributes import patterns_seen, program_of
-from workflows.ingest.report.expected_psnr import expected, left_of, model_error_of
+from workflows.ingest.light.stack_attributes import program_of
+from workflows.ingest.report.expected_psnr import expected
 from workflows.ingest.report.figures import (
     LEVELS,
     Clipping,
@@ -41,15 +41,7 @@ def report(attributes: dict[str, Any], frames: int) -> Report:
     program = program_of(attributes)
     quality = None
     if not attributes.get("order") and not is_blown(attributes["survey"]):
-        quality = expected(
-            program,
-            patterns_seen(attributes),
-            attributes["survey"],
-            model_error_of(attributes),
-            attributes.get("pattern_error"),
-            attributes.get("auto_exposure"),
-            left_of(program, attributes),
-        )
+        quality = expected(program, attributes)
     survey, noise, steadiness = attributes["survey"], attributes["noise"], attributes.get("steadiness") or {}
     figures = Figures(
         frames=Frames(
