@@ -2,7 +2,7 @@
 
 from typing import Any, Literal
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationInfo, field_validator
 
 from workflows.images.tone_curves import CameraCurve
 
@@ -13,7 +13,7 @@ LEVELS: tuple[Level, ...] = ("good", "warning", "bad")
 class Finding(BaseModel):
     """One aspect of a capture.
 
-    ``name`` is stable, for programs. ``message`` says what was found, and ``remedy`` what to do about it; it is empty
+    ``name`` is stable, for programs. ``message`` says what was found, and ``remedy`` what to do about it; it is dropped
     if the level is good. ``cost`` is the mean square error that composites have by it, of full scale, or None if that
     is not known.
     """
@@ -23,6 +23,11 @@ class Finding(BaseModel):
     message: str
     remedy: str = ""
     cost: float | None = None
+
+    @field_validator("remedy")
+    @classmethod
+    def _none_if_good(cls, remedy: str, info: ValidationInfo) -> str:
+        return "" if info.data["level"] == "good" else remedy
 
 
 def graded(value: float, warning: float, bad: float) -> Level:

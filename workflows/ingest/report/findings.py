@@ -42,35 +42,35 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     if attributes.get("order"):  # what else would be found means nothing
         return [order(**attributes["order"], files=files), frames(figures)]
     white = figures.flicker.white_percent if figures.flicker else 0.0
-    found = [
-        *odd_frames(attributes.get("odd_frames", []), files),
+    found: list[Finding | None] = [
+        odd_frames(attributes.get("odd_frames", []), files),
         # What followed the camera's own exposure is corrected.
-        *constants(None if attributes.get("auto_exposure") else attributes.get("constants_apart"), files),
+        constants(None if attributes.get("auto_exposure") else attributes.get("constants_apart"), files),
         *_exposure(figures, attributes["storage"]),
-        *_auto_exposure(
+        _auto_exposure(
             attributes.get("auto_exposure"), costs["auto_exposure"], filmed=figures.video is not None
         ),
-        *_tone_mapping(attributes.get("tone_mapping")),
-        *_steadiness(attributes),
-        *_drift(figures.drift),
-        *_scaling(program, scaled=attributes.get("scaled", False)),
-        *_white_apart(white),
+        _tone_mapping(attributes.get("tone_mapping")),
+        _steadiness(attributes),
+        _drift(figures.drift),
+        _scaling(program, scaled=attributes.get("scaled", False)),
+        _white_apart(white),
         *curves(figures, program, linear=attributes["storage"]["black"] > 0, dimmed=abs(white) >= DIMMED),
-        *_glare(attributes.get("glare")),
+        _glare(attributes.get("glare")),
         _crosstalk(figures, program, grey=survey.get("grey", False)),
-        *unexplained(costs["model_error"], model_error_of(attributes)),
-        *lost_colour(program, costs["lost_colour"], half_colour=attributes.get("half_colour", False)),
-        *_noise(figures, attributes, costs["noise"]),
-        *_flicker(figures.flicker, files, mapped=bool(attributes.get("tone_mapping"))),
+        unexplained(costs["model_error"], model_error_of(attributes)),
+        lost_colour(program, costs["lost_colour"], half_colour=attributes.get("half_colour", False)),
+        _noise(figures, attributes, costs["noise"]),
+        _flicker(figures.flicker, files, mapped=bool(attributes.get("tone_mapping"))),
         frames(figures),
-        *quality(
+        quality(
             figures.quality,
             random=any(isinstance(part, Bernoulli) for part in program.parts),
             exposed=costs["auto_exposure"] > 0,
         ),
-        *unmeasured(figures, program, attributes),
+        unmeasured(figures, program, attributes),
     ]
-    return sorted(found, key=lambda one: (-LEVELS.index(one.level), -(one.cost or 0.0)))
+    return sorted(filter(None, found), key=lambda one: (-LEVELS.index(one.level), -(one.cost or 0.0)))
 
 
 def _exposure(figures: Figures, storage: dict[str, Any]) -> list[Finding]:
@@ -84,9 +84,7 @@ def _exposure(figures: Figures, storage: dict[str, Any]) -> list[Finding]:
             name="black",
             level=level,
             message=f"the black frame is clipped in {100 * black:.1f} % of the pixels",
-            remedy=""
-            if level == "good"
-            else "raise the camera's black level, let a little light into the room, or shoot RAW: values below black "
+            remedy="raise the camera's black level, let a little light into the room, or shoot RAW: values below black "
             "are lost, and dark glass becomes too bright",
         )
     )
@@ -118,199 +116,164 @@ def _white(figures: Figures) -> Finding:
     )
 
 
-def _steadiness(attributes: dict[str, Any]) -> list[Finding]:
+def _steadiness(attributes: dict[str, Any]) -> Finding | None:
     found, free = attributes.get("steadiness"), is_free(attributes.get("auto_exposure"))
     if found is None or (found.get("drift") and (found.get("flicker") or free)):
-        return []
+        return None
     if is_steady_enough(attributes):
-        return [
-            Finding(
-                name="steadiness",
-                level="good",
-                message="neither the camera moved nor the light flickered by so much that it shows",
-            )
-        ]
-    return [
-        Finding(
+        return Finding(
             name="steadiness",
-            level="warning",
-            message="the frames differ from what the patterns explain in ways that are neither a movement of the "
-            "camera nor a flicker of the light, so these can't be measured",
-            remedy="switch HDR, sharpening and noise reduction of the camera off, or shoot RAW; check that the frames "
-            "show the patterns that capture.json names, and that neither camera nor glass moved by more than three "
-            "pixels",
+            level="good",
+            message="neither the camera moved nor the light flickered by so much that it shows",
         )
-    ]
+    return Finding(
+        name="steadiness",
+        level="warning",
+        message="the frames differ from what the patterns explain in ways that are neither a movement of the "
+        "camera nor a flicker of the light, so these can't be measured",
+        remedy="switch HDR, sharpening and noise reduction of the camera off, or shoot RAW; check that the frames "
+        "show the patterns that capture.json names, and that neither camera nor glass moved by more than three "
+        "pixels",
+    )
 
 
-def _drift(drift: Drift | None) -> list[Finding]:
+def _drift(drift: Drift | None) -> Finding | None:
     if drift is None:
-        return []
+        return None
     # A corrected drift leaves a small rest; a drift within its own error is none.
     limits = (0.5, 2.0) if drift.corrected else (0.1, 0.5)
     level = graded(drift.pixels if drift.corrected or drift.pixels > SURE * drift.error else 0.0, *limits)
     found = f"the camera moved by {drift.pixels:.2f} pixels (a frame is located to {drift.error:.3f})"
-    return [
-        Finding(
-            name="drift",
-            level=level,
-            message=found + (": recovery shifts the frames back" if drift.corrected else ""),
-            remedy=""
-            if level == "good"
-            else "fix camera, glass and monitor better, use a remote release, and film again: "
-            + (
-                "so large a drift is corrected only in part"
-                if drift.corrected
-                else "no common shift of the frames explains it, so it is not corrected"
-            ),
-        )
-    ]
+    return Finding(
+        name="drift",
+        level=level,
+        message=found + (": recovery shifts the frames back" if drift.corrected else ""),
+        remedy="fix camera, glass and monitor better, use a remote release, and film again: "
+        + (
+            "so large a drift is corrected only in part"
+            if drift.corrected
+            else "no common shift of the frames explains it, so it is not corrected"
+        ),
+    )
 
 
-def _tone_mapping(found: dict[str, float] | None) -> list[Finding]:
+def _tone_mapping(found: dict[str, float] | None) -> Finding | None:
     """Local tone mapping that is not certain is not reported: it is left out of recovery too."""
     if not found:
-        return []
+        return None
     percent = 100 * found["power"] * found["spread"]
-    level = graded(percent, 1.0, 10.0)
-    return [
-        Finding(
-            name="tone_mapping",
-            level=level,
-            message=f"the camera brightens what is dark around a place and darkens what is bright, by {percent:.1f} % "
-            "between patterns, as local tone mapping and HDR do: recovery corrects it",
-            remedy=""
-            if level == "good"
-            else "switch HDR and every enhancement of the camera off, or shoot RAW",
-        )
-    ]
+    return Finding(
+        name="tone_mapping",
+        level=graded(percent, 1.0, 10.0),
+        message=f"the camera brightens what is dark around a place and darkens what is bright, by {percent:.1f} % "
+        "between patterns, as local tone mapping and HDR do: recovery corrects it",
+        remedy="switch HDR and every enhancement of the camera off, or shoot RAW",
+    )
 
 
-def _flicker(flicker: Flicker | None, files: list[str] | None, *, mapped: bool) -> list[Finding]:
+def _flicker(flicker: Flicker | None, files: list[str] | None, *, mapped: bool) -> Finding | None:
     if flicker is None:
-        return []
+        return None
     limits = (2.0, 10.0) if flicker.corrected else (0.5, 2.0)
     level = graded(flicker.percent if flicker.percent > SURE * flicker.error else 0.0, *limits)
     if level != "good" and flicker.follows < FOLLOWS and not mapped:
-        return [
-            Finding(
-                name="tone_mapping",
-                level=level,
-                message=f"the camera brightens dark pictures and darkens bright ones, by {flicker.percent:.1f} % "
-                "between patterns, as local tone mapping and HDR do"
-                + (": recovery corrects what all of a frame has in common" if flicker.corrected else ""),
-                remedy="switch HDR and every enhancement of the camera off, or shoot RAW",
-            )
-        ]
-    return [
-        Finding(
-            name="flicker",
+        return Finding(
+            name="tone_mapping",
             level=level,
-            message=f"the light varies by {flicker.percent:.2f} % between frames, by {flicker.worst_percent:+.1f} % in "
-            f"frame {named([flicker.worst_frame], files)}"
-            + (": recovery corrects it" if flicker.corrected else ""),
-            remedy=""
-            if level == "good"
-            else "switch automatic exposure and the monitor's dimming off, leave the light of the room as it is, let "
-            "the monitor warm up, and expose for whole periods of its refresh"
-            + (
-                ": so much is corrected only in part"
-                if flicker.corrected
-                else ": it is not corrected, because it is not certain, or no frame is black"
-            ),
+            message=f"the camera brightens dark pictures and darkens bright ones, by {flicker.percent:.1f} % "
+            "between patterns, as local tone mapping and HDR do"
+            + (": recovery corrects what all of a frame has in common" if flicker.corrected else ""),
+            remedy="switch HDR and every enhancement of the camera off, or shoot RAW",
         )
-    ]
+    return Finding(
+        name="flicker",
+        level=level,
+        message=f"the light varies by {flicker.percent:.2f} % between frames, by {flicker.worst_percent:+.1f} % in "
+        f"frame {named([flicker.worst_frame], files)}"
+        + (": recovery corrects it" if flicker.corrected else ""),
+        remedy="switch automatic exposure and the monitor's dimming off, leave the light of the room as it is, let "
+        "the monitor warm up, and expose for whole periods of its refresh"
+        + (
+            ": so much is corrected only in part"
+            if flicker.corrected
+            else ": it is not corrected, because it is not certain, or no frame is black"
+        ),
+    )
 
 
-def _white_apart(percent: float) -> list[Finding]:
+def _white_apart(percent: float) -> Finding | None:
     """White frames that are darker, or brighter, than what is white in patterns."""
     if abs(percent) < DIMMED:
-        return []
-    return [
-        Finding(
-            name="white",
-            level=graded(abs(percent), DIMMED, 25.0),
-            message=f"a white monitor differs by {percent:+.0f} % from what is white in patterns, as when a monitor "
-            "limits its brightness, or exposure is not locked: recovery corrects it, and composites are exposed as "
-            "patterns were",
-            remedy="lock exposure and ISO, make the monitor darker, and switch its dimming off: the camera's curve "
-            "can't be measured by half-tones that are dimmed too",
-        )
-    ]
+        return None
+    return Finding(
+        name="white",
+        level=graded(abs(percent), DIMMED, 25.0),
+        message=f"a white monitor differs by {percent:+.0f} % from what is white in patterns, as when a monitor "
+        "limits its brightness, or exposure is not locked: recovery corrects it, and composites are exposed as "
+        "patterns were",
+        remedy="lock exposure and ISO, make the monitor darker, and switch its dimming off: the camera's curve "
+        "can't be measured by half-tones that are dimmed too",
+    )
 
 
-def _auto_exposure(exposed: list[float] | None, cost: float, *, filmed: bool) -> list[Finding]:
+def _auto_exposure(exposed: list[float] | None, cost: float, *, filmed: bool) -> Finding | None:
     if exposed is None:
-        return []
+        return None
     usual = float(np.median(exposed))
     most = max(max(exposed) / usual - 1, 1 - min(exposed) / usual)
     level = graded(most, 0.03, 0.25)
-    return [
-        Finding(
-            name="auto_exposure",
-            level=level,
-            message=f"the camera's exposure changed by up to {100 * most:.0f} % from pattern to pattern, "
-            + ("as the border shows" if filmed else "as its files state")
-            + ": recovery follows it, and composites are exposed as white was",
-            cost=cost or None,
-            remedy=""
-            if level == "good"
-            else lock_exposure(filmed=filmed)
-            + (
-                ": so large a change is followed only in part, and hides the camera's curve"
-                if level == "bad"
-                else ""
-            ),
-        )
-    ]
+    return Finding(
+        name="auto_exposure",
+        level=level,
+        message=f"the camera's exposure changed by up to {100 * most:.0f} % from pattern to pattern, "
+        + ("as the border shows" if filmed else "as its files state")
+        + ": recovery follows it, and composites are exposed as white was",
+        cost=cost or None,
+        remedy=lock_exposure(filmed=filmed)
+        + (
+            ": so large a change is followed only in part, and hides the camera's curve"
+            if level == "bad"
+            else ""
+        ),
+    )
 
 
-def _glare(shares: list[float] | None) -> list[Finding]:
+def _glare(shares: list[float] | None) -> Finding | None:
     """Glare below 1 % is not reported: it is left out of recovery too."""
     if not shares:
-        return []
-    level = graded(sum(shares), 0.03, 0.3)
-    return [
-        Finding(
-            name="glare",
-            level=level,
-            message=f"veiling glare: {100 * sum(shares):.0f} % of the light comes from around the place that a pixel "
-            "sees, scattered in the lens, the room or the glass. Composites have it too",
-            remedy=""
-            if level == "good"
-            else "clean the lens, darken the room, and keep bright things beside the monitor out of the picture",
-        )
-    ]
+        return None
+    return Finding(
+        name="glare",
+        level=graded(sum(shares), 0.03, 0.3),
+        message=f"veiling glare: {100 * sum(shares):.0f} % of the light comes from around the place that a pixel "
+        "sees, scattered in the lens, the room or the glass. Composites have it too",
+        remedy="clean the lens, darken the room, and keep bright things beside the monitor out of the picture",
+    )
 
 
-def _noise(figures: Figures, attributes: dict[str, Any], cost: float) -> list[Finding]:
+def _noise(figures: Figures, attributes: dict[str, Any], cost: float) -> Finding | None:
     survey = attributes["survey"]
     ratio = survey["contrast"] / survey["deviation"] if survey["deviation"] else 0.0
     if ratio <= 1:
-        return [
-            Finding(
-                name="noise",
-                level="bad",
-                message="the white frame is no brighter than the black one: the frames do not see the monitor",
-                remedy="take the cap off the lens, switch the monitor on, and see that it fills the picture behind the "
-                "object",
-            )
-        ]
+        return Finding(
+            name="noise",
+            level="bad",
+            message="the white frame is no brighter than the black one: the frames do not see the monitor",
+            remedy="take the cap off the lens, switch the monitor on, and see that it fills the picture behind the "
+            "object",
+        )
     level = graded(-ratio, -25, -8)
     if level == "good" and is_assumed(attributes):
-        return []
-    found = Finding(
+        return None
+    return Finding(
         name="noise",
         level=level,
         cost=cost or None,
         message=f"noise of {figures.noise.black:.1f} grey levels of 8 bits at black, {figures.noise.full:.1f} at full "
         f"scale; white minus black is {ratio:.0f} times that of a pixel between them",
-        remedy=""
-        if level == "good"
-        else "expose longer at a lower ISO, take several frames of each pattern, make the monitor brighter or the room "
-        "darker",
+        remedy="expose longer at a lower ISO, take several frames of each pattern, make the monitor brighter or the "
+        "room darker",
     )
-    return [found]
 
 
 def _crosstalk(figures: Figures, program: Program, *, grey: bool) -> Finding:
@@ -327,24 +290,20 @@ def _crosstalk(figures: Figures, program: Program, *, grey: bool) -> Finding:
         if grey
         else "the program does not show red, green and blue one at a time, so how much the camera's channels see of "
         "the other colours is not measured, and not corrected",
-        remedy="" if grey else "add constant frames of red, green and blue, as the presets do",
+        remedy="add constant frames of red, green and blue, as the presets do",
     )
 
 
-def _scaling(program: Program, *, scaled: bool) -> list[Finding]:
+def _scaling(program: Program, *, scaled: bool) -> Finding | None:
     if not program.halftones[0].size:
-        return []
+        return None
     if not scaled:
-        return [
-            Finding(name="scaling", level="good", message="the monitor showed the patterns pixel by pixel")
-        ]
-    return [
-        Finding(
-            name="scaling",
-            level="warning",
-            message="the monitor showed the patterns at another size than they were made for, as their half-tones "
-            "tell: recovery corrects it",
-            remedy="set the browser's zoom to 100 % (Ctrl+0 or ⌘0), or play the film at its own size, and make the "
-            "program for the monitor's size",
-        )
-    ]
+        return Finding(name="scaling", level="good", message="the monitor showed the patterns pixel by pixel")
+    return Finding(
+        name="scaling",
+        level="warning",
+        message="the monitor showed the patterns at another size than they were made for, as their half-tones "
+        "tell: recovery corrects it",
+        remedy="set the browser's zoom to 100 % (Ctrl+0 or ⌘0), or play the film at its own size, and make the "
+        "program for the monitor's size",
+    )

@@ -83,32 +83,28 @@ def named(numbers: Iterable[int], files: Sequence[str] | None) -> str:
     return ", ".join(f"{run} ({' … '.join(of)})" for run, of in zip(runs, ends, strict=True))
 
 
-def odd_frames(odd: list[int], files: Sequence[str] | None) -> list[Finding]:
+def odd_frames(odd: list[int], files: Sequence[str] | None) -> Finding | None:
     """Single frames that do not show their patterns."""
     if not odd:
-        return []
-    return [
-        Finding(
-            name="odd_frames",
-            level="warning",
-            message="not all frames show their patterns, as with a hand in the picture, a flash, or another still in "
-            f"the place of one: recovery does without {named(odd, files)}",
-            remedy="keep everything still and dark while the patterns are shown, and take one still of each",
-        )
-    ]
+        return None
+    return Finding(
+        name="odd_frames",
+        level="warning",
+        message="not all frames show their patterns, as with a hand in the picture, a flash, or another still in "
+        f"the place of one: recovery does without {named(odd, files)}",
+        remedy="keep everything still and dark while the patterns are shown, and take one still of each",
+    )
 
 
-def constants(apart: dict[str, Any] | None, files: Sequence[str] | None) -> list[Finding]:
+def constants(apart: dict[str, Any] | None, files: Sequence[str] | None) -> Finding | None:
     """Frames of black, or of white, that differ."""
     if apart is None:
-        return []
-    return [
-        Finding(
-            name="constants",
-            level=graded(apart["share"], 0, SPREAD),
-            message=f"frames {named(apart['frames'], files)} were taken of the same, but differ in "
-            f"{100 * apart['share']:.0f} % of the picture by more than a tenth of white",
-            remedy="take all again with exposure and white balance locked, the light of the room as it is, and camera "
-            "and glass at rest",
-        )
-    ]
+        return None
+    return Finding(
+        name="constants",
+        level=graded(apart["share"], 0, SPREAD),
+        message=f"frames {named(apart['frames'], files)} were taken of the same, but differ in "
+        f"{100 * apart['share']:.0f} % of the picture by more than a tenth of white",
+        remedy="take all again with exposure and white balance locked, the light of the room as it is, and camera "
+        "and glass at rest",
+    )

@@ -24,7 +24,7 @@ APART = 0.03
 mapping and flicker make."""
 
 
-def quality(expected: Quality | None, *, random: bool, exposed: bool) -> list[Finding]:
+def quality(expected: Quality | None, *, random: bool, exposed: bool) -> Finding | None:
     """The PSNR to expect, graded by the middle of its range.
 
     Parameters
@@ -36,7 +36,7 @@ def quality(expected: Quality | None, *, random: bool, exposed: bool) -> list[Fi
         Whether the camera's exposure was not locked, which decides the low end of a program with random patterns.
     """
     if expected is None:
-        return []
+        return None
     if not random:
         worst, best, why = "backdrops finer than the patterns", "coarser ones", ""
     elif expected.blocks is None:
@@ -52,37 +52,31 @@ def quality(expected: Quality | None, *, random: bool, exposed: bool) -> list[Fi
     low, high = f"{expected.low:.0f}", f"{expected.high:.0f}"
     span = f"{low} dB" if low == high else f"{low} dB ({worst}) to {high} dB ({best})"
     level = graded(-(expected.low + expected.high) / 2, -FEW, -TOO_FEW)
-    return [
-        Finding(
-            name="quality",
-            level=level,
-            message=f"expect composites of about {span}, if nothing else is wrong{why}",
-            remedy=""
-            if level == "good"
-            else "follow the other findings, first the one that costs most; show more patterns, as the preset "
-            "`default` does",
-        )
-    ]
+    return Finding(
+        name="quality",
+        level=level,
+        message=f"expect composites of about {span}, if nothing else is wrong{why}",
+        remedy="follow the other findings, first the one that costs most; show more patterns, as the preset "
+        "`default` does",
+    )
 
 
-def unexplained(cost: float, share: float) -> list[Finding]:
+def unexplained(cost: float, share: float) -> Finding | None:
     """What neither T nor noise explains."""
     if cost < SHOWS:
-        return []
-    return [
-        Finding(
-            name="unexplained",
-            level=graded(cost, SHOWS, SPOILS),
-            message=f"{100 * share:.1f} % of the light is explained neither by the patterns nor by noise, as with "
-            f"sharpening, compression or scattered light: that alone limits composites to about {_dB(cost)} dB",
-            remedy="switch HDR, sharpening and noise reduction of the camera off, shoot RAW, or film at a higher bit "
-            "rate",
-            cost=cost,
-        )
-    ]
+        return None
+    return Finding(
+        name="unexplained",
+        level=graded(cost, SHOWS, SPOILS),
+        message=f"{100 * share:.1f} % of the light is explained neither by the patterns nor by noise, as with "
+        f"sharpening, compression or scattered light: that alone limits composites to about {_dB(cost)} dB",
+        remedy="switch HDR, sharpening and noise reduction of the camera off, shoot RAW, or film at a higher bit "
+        "rate",
+        cost=cost,
+    )
 
 
-def lost_colour(program: Program, cost: float, *, half_colour: bool) -> list[Finding]:
+def lost_colour(program: Program, cost: float, *, half_colour: bool) -> Finding | None:
     """Detail of colours, of the patterns or else of the glass, that frames don't hold.
 
     Parameters
@@ -95,27 +89,23 @@ def lost_colour(program: Program, cost: float, *, half_colour: bool) -> list[Fin
     """
     limit = f"that alone limits composites to about {_dB(cost)} dB" if cost >= SHOWS else ""
     if half_colour and program.in_colour:
-        return [
-            Finding(
-                name="coloured_patterns",
-                level=graded(cost, 0, SPOILS),
-                message="the patterns are in colour, which these frames store at half the resolution: "
-                + (limit or "that costs composites up to 8 dB"),
-                remedy="shoot RAW, or show patterns in black and white: `envmatte patterns --grey`",
-                cost=cost or None,
-            )
-        ]
-    if not limit:
-        return []
-    return [
-        Finding(
-            name="colour_detail",
-            level="warning",
-            message=f"the colours of the glass are finer than its frames store them, at half the resolution: {limit}",
-            remedy="let the glass fill more of the frame, or shoot RAW",
-            cost=cost,
+        return Finding(
+            name="coloured_patterns",
+            level=graded(cost, 0, SPOILS),
+            message="the patterns are in colour, which these frames store at half the resolution: "
+            + (limit or "that costs composites up to 8 dB"),
+            remedy="shoot RAW, or show patterns in black and white: `envmatte patterns --grey`",
+            cost=cost or None,
         )
-    ]
+    if not limit:
+        return None
+    return Finding(
+        name="colour_detail",
+        level="warning",
+        message=f"the colours of the glass are finer than its frames store them, at half the resolution: {limit}",
+        remedy="let the glass fill more of the frame, or shoot RAW",
+        cost=cost,
+    )
 
 
 def curves(figures: Figures, program: Program, *, linear: bool, dimmed: bool) -> list[Finding]:
@@ -176,7 +166,7 @@ def curves(figures: Figures, program: Program, *, linear: bool, dimmed: bool) ->
     return found
 
 
-def unmeasured(figures: Figures, program: Program, attributes: dict[str, Any]) -> list[Finding]:
+def unmeasured(figures: Figures, program: Program, attributes: dict[str, Any]) -> Finding | None:
     """What could not be measured, all in one."""
     lacking: list[str] = []
     remedies: dict[str, None] = {}
@@ -219,15 +209,13 @@ def unmeasured(figures: Figures, program: Program, attributes: dict[str, Any]) -
             "film the program with its border",
         )
     if not lacking:
-        return []
-    return [
-        Finding(
-            name="unmeasured",
-            level="warning",
-            message=f"not measured: {'; '.join(lacking)}",
-            remedy="; ".join(remedies),
-        )
-    ]
+        return None
+    return Finding(
+        name="unmeasured",
+        level="warning",
+        message=f"not measured: {'; '.join(lacking)}",
+        remedy="; ".join(remedies),
+    )
 
 
 def is_blown(survey: dict[str, Any]) -> bool:

@@ -26,31 +26,35 @@ MONITOR = 160, 120
 )
 def test_expected_quality_is_graded(low: float, high: float, level: str) -> None:
     expected = Quality(low=low, high=high, blocks=None)
-    (found,) = quality(expected, random=True, exposed=False)
+    found = quality(expected, random=True, exposed=False)
+    assert found is not None
     assert found.level == level
     assert bool(found.remedy) == (level != "good")
     assert f"{low} dB (dispersion, many edges) to {high} dB (clear glass)" in found.message
-    (found,) = quality(expected, random=True, exposed=True)
+    found = quality(expected, random=True, exposed=True)
+    assert found is not None
     assert (
         f"{low} dB (if the scene is to be exposed otherwise) to {high} dB (exposed as white" in found.message
     )
 
 
 def test_exposure_decides_no_end_of_what_stripes_alone_promise() -> None:
-    (found,) = quality(Quality(low=30, high=38, blocks=None), random=False, exposed=True)
+    found = quality(Quality(low=30, high=38, blocks=None), random=False, exposed=True)
+    assert found is not None
     assert "30 dB (backdrops finer than the patterns) to 38 dB (coarser ones)" in found.message
 
 
 def test_nothing_is_said_of_an_unknown_quality() -> None:
-    assert quality(None, random=True, exposed=False) == []
+    assert quality(None, random=True, exposed=False) is None
 
 
 @pytest.mark.parametrize(("cost", "level"), [(1e-3, "warning"), (1e-2, "bad")])
 def test_errors_are_graded_by_their_cost(cost: float, level: str) -> None:
-    (found,) = unexplained(cost, 0.03)
+    found = unexplained(cost, 0.03)
+    assert found is not None
     assert (found.level, found.cost) == (level, cost)
     assert f"about {-10 * np.log10(cost):.0f} dB" in found.message
-    assert unexplained(1e-5, 0.003) == []
+    assert unexplained(1e-5, 0.003) is None
 
 
 @pytest.fixture(scope="module")
@@ -59,17 +63,19 @@ def program() -> Program:
 
 
 def test_lost_detail_of_colours_is_that_of_patterns_in_colour_or_else_of_the_glass(program: Program) -> None:
-    (of_glass,) = lost_colour(program, 1e-3, half_colour=True)
+    of_glass = lost_colour(program, 1e-3, half_colour=True)
+    assert of_glass is not None
     assert (of_glass.name, of_glass.cost) == ("colour_detail", 1e-3)
-    assert lost_colour(program, 1e-5, half_colour=True) == []
+    assert lost_colour(program, 1e-5, half_colour=True) is None
     coloured = preset("quick")
-    assert lost_colour(coloured, 0.0, half_colour=False) == []
+    assert lost_colour(coloured, 0.0, half_colour=False) is None
     for cost, level, said in (
         (0.0, "warning", "up to 8 dB"),
         (1e-3, "warning", "about 30 dB"),
         (1e-2, "bad", "20 dB"),
     ):
-        (of_patterns,) = lost_colour(coloured, cost, half_colour=True)
+        of_patterns = lost_colour(coloured, cost, half_colour=True)
+        assert of_patterns is not None
         assert (of_patterns.name, of_patterns.level) == ("coloured_patterns", level)
         assert said in of_patterns.message
 
