@@ -10,11 +10,12 @@ from workflows.ingest.report.expected_psnr import costs_of, model_error_of
 from workflows.ingest.report.figures import LEVELS, Drift, Figures, Finding, Flicker, graded
 from workflows.ingest.report.frame_findings import constants, frames, named, odd_frames, order
 from workflows.ingest.report.limits import (
-    curves,
+    camera_curve,
     is_assumed,
     is_steady_enough,
     lock_exposure,
     lost_colour,
+    monitor_curve,
     quality,
     unexplained,
     unmeasured,
@@ -37,7 +38,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     cost most when measured (`tests.benchmarks.recovery.devices`): exposure, the camera's own processing, movement,
     scaled patterns, curves, glare, colours.
     """
-    survey, costs = attributes["survey"], costs_of(program, attributes)
+    survey, storage, costs = attributes["survey"], attributes["storage"], costs_of(program, attributes)
     files = attributes.get("files")  # missing from films, and captures of earlier versions
     if attributes.get("order"):  # what else would be found means nothing
         return [order(**attributes["order"], files=files), frames(figures)]
@@ -46,7 +47,8 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         odd_frames(attributes.get("odd_frames", []), files),
         # What followed the camera's own exposure is corrected.
         constants(None if attributes.get("auto_exposure") else attributes.get("constants_apart"), files),
-        *_exposure(figures, attributes["storage"]),
+        _exposure(figures) if storage["bounded"] else None,
+        _black(figures.clipping.black, linear=storage["black"] > 0),
         _auto_exposure(
             attributes.get("auto_exposure"), costs["auto_exposure"], filmed=figures.video is not None
         ),
@@ -55,7 +57,8 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         _drift(figures.drift),
         _scaling(program, scaled=attributes.get("scaled", False)),
         _white_apart(white),
-        *curves(figures, program, linear=attributes["storage"]["black"] > 0, dimmed=abs(white) >= DIMMED),
+        camera_curve(figures.camera, linear=storage["black"] > 0, dimmed=abs(white) >= DIMMED),
+        monitor_curve(figures.monitor, program),
         _glare(attributes.get("glare")),
         _crosstalk(figures, program, grey=survey.get("grey", False)),
         unexplained(costs["model_error"], model_error_of(attributes)),
@@ -73,25 +76,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
     return sorted(filter(None, found), key=lambda one: (-LEVELS.index(one.level), -(one.cost or 0.0)))
 
 
-def _exposure(figures: Figures, storage: dict[str, Any]) -> list[Finding]:
-    found = []
-    if storage["bounded"]:
-        found.append(_white(figures))
-    black = figures.clipping.black
-    level = graded(black, 0.05, 0.3) if storage["black"] == 0 else "good"
-    found.append(
-        Finding(
-            name="black",
-            level=level,
-            message=f"the black frame is clipped in {100 * black:.1f} % of the pixels",
-            remedy="raise the camera's black level, let a little light into the room, or shoot RAW: values below black "
-            "are lost, and dark glass becomes too bright",
-        )
-    )
-    return found
-
-
-def _white(figures: Figures) -> Finding:
+def _exposure(figures: Figures) -> Finding:
     clipped, reach = figures.clipping.white, figures.white_reaches
     level = graded(clipped, 0.002, 0.05)
     if level != "good":
@@ -113,6 +98,17 @@ def _white(figures: Figures) -> Finding:
         level=level,
         message=f"white reaches only {share}",
         remedy=f"expose {more} more",
+    )
+
+
+def _black(clipped: float, *, linear: bool) -> Finding:
+    """Black that is clipped; values of linear light have room below it."""
+    return Finding(
+        name="black",
+        level="good" if linear else graded(clipped, 0.05, 0.3),
+        message=f"the black frame is clipped in {100 * clipped:.1f} % of the pixels",
+        remedy="raise the camera's black level, let a little light into the room, or shoot RAW: values below black "
+        "are lost, and dark glass becomes too bright",
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from workflows.images.tone_curves import CameraCurve, Sampled, to_light
 from workflows.ingest.camera.border_exposure import is_free
 from workflows.ingest.report.expected_psnr import beside_noise
-from workflows.ingest.report.figures import Figures, Finding, Quality, graded
+from workflows.ingest.report.figures import Figures, Finding, Quality, ToneCurve, graded
 from workflows.programs.parts import Images
 from workflows.programs.program import Program
 
@@ -108,62 +108,61 @@ def lost_colour(program: Program, cost: float, *, half_colour: bool) -> Finding 
     )
 
 
-def curves(figures: Figures, program: Program, *, linear: bool, dimmed: bool) -> list[Finding]:
-    """The tone curves that were measured or don't matter, and those that are assumed.
+def camera_curve(camera: ToneCurve, *, linear: bool, dimmed: bool) -> Finding | None:
+    """The camera's curve: measured, assumed, or stated and right or wrong.
 
     Parameters
     ----------
+    camera : ToneCurve
     linear : bool
         Whether the frames' format holds linear light.
     dimmed : bool
         Whether white differs between white frames and patterns: then half-tones do not tell whether a curve is right.
     """
-    found = []
-    camera, monitor = figures.camera, figures.monitor
-    off = camera.apart is not None and abs(camera.apart) > APART and not dimmed
+    apart = None if dimmed else camera.apart
     if camera.source == "assumed":
-        found.append(_assumed("camera", camera.curve))
-    elif off and camera.source == "given":
-        assert camera.apart is not None
-        found.append(
-            Finding(
-                name="camera_curve",
-                level="warning",
-                message=f"the camera's curve is {_shape(camera.curve)}, stated by the capture, but by this curve "
-                f"half-tones are off by {100 * camera.apart:+.0f} % of white",
-                remedy='set `"response": "unknown"` in capture.json: the curve is then measured from the half-tones',
-            )
+        return _assumed("camera", camera.curve)
+    if camera.source == "given" and apart is not None and abs(apart) > APART:
+        return Finding(
+            name="camera_curve",
+            level="warning",
+            message=f"the camera's curve is {_shape(camera.curve)}, stated by the capture, but by this curve "
+            f"half-tones are off by {100 * apart:+.0f} % of white",
+            remedy='set `"response": "unknown"` in capture.json: the curve is then measured from the half-tones',
         )
-    elif linear or ((camera.source == "estimated" or camera.apart is not None) and not dimmed):
-        how = (
-            "as the format of the frames says"
-            if linear
-            else "estimated from constant levels and half-tones"
-            if camera.source == "estimated"
-            else "stated by the capture, and half-tones agree"
-        )
-        found.append(
-            Finding(
-                name="camera_curve",
-                level="good",
-                message=f"the camera's curve is {_shape(camera.curve)}, {how}",
-            )
-        )
-    if monitor.source == "assumed" and _shows_greys(program):
-        found.append(_assumed("monitor", monitor.curve))
-    elif monitor.source == "estimated" or not _shows_greys(program):
-        harmless = "" if _shows_greys(program) else "; it makes no difference to black and white"
-        how = {"given": "stated by the capture", "estimated": "estimated from constant levels"}.get(
-            monitor.source, "only assumed"
-        )
-        found.append(
-            Finding(
-                name="monitor_curve",
-                level="good",
-                message=f"the monitor's curve is {_shape(monitor.curve)}, {how}{harmless}",
-            )
-        )
-    return found
+    if linear:
+        how = "as the format of the frames says"
+    elif camera.source == "estimated" and not dimmed:
+        how = "estimated from constant levels and half-tones"
+    elif apart is not None:
+        how = "stated by the capture, and half-tones agree"
+    else:
+        return None
+    return Finding(
+        name="camera_curve",
+        level="good",
+        message=f"the camera's curve is {_shape(camera.curve)}, {how}",
+    )
+
+
+def monitor_curve(monitor: ToneCurve, program: Program) -> Finding | None:
+    """The monitor's curve, unless it is stated and makes a difference."""
+    matters = _shows_greys(program)
+    if monitor.source == "assumed" and matters:
+        return _assumed("monitor", monitor.curve)
+    if monitor.source == "given" and matters:
+        return None
+    how = {
+        "given": "stated by the capture",
+        "estimated": "estimated from constant levels",
+        "assumed": "only assumed",
+    }[monitor.source]
+    harmless = "" if matters else "; it makes no difference to black and white"
+    return Finding(
+        name="monitor_curve",
+        level="good",
+        message=f"the monitor's curve is {_shape(monitor.curve)}, {how}{harmless}",
+    )
 
 
 def unmeasured(figures: Figures, program: Program, attributes: dict[str, Any]) -> Finding | None:
