@@ -9,7 +9,7 @@ Each workflow declares its steps beside them, as ``STEPS``: `workflows.ingest.st
 
 import time
 from collections.abc import Callable, Container, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from storage.objects.store import Objects
@@ -120,3 +120,11 @@ def run(steps: Steps, objects: Objects, task: Task, tile: int) -> tuple[float, A
     else:
         result = steps.work(objects, task, tile)
     return time.perf_counter() - start, result
+
+
+def run_all(steps: Steps, objects: Objects, task: Task) -> None:
+    """Run all steps of a job in this process, one after another."""
+    _, plan = run(steps, objects, task, PREPARE)
+    task = replace(task, plan=plan)
+    for step in (*range(plan["tiles"]), FINISH):
+        run(steps, objects, task, step)

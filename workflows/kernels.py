@@ -13,7 +13,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +23,6 @@ from numba.core.registry import CPUDispatcher
 from storage.layout import uploads
 from storage.layout.mattes import Block, Matte, create
 from storage.objects.store import Objects
-from storage.steps import FINISH, PREPARE
 from workflows.composite import composite
 from workflows.composite.backdrops.backdrop import backdrop_of
 from workflows.composite.backdrops.placement import Placement
@@ -35,7 +33,7 @@ from workflows.images import integer_formats
 from workflows.images.decode import decode
 from workflows.images.tone_curves import from_light
 from workflows.ingest.steps import STEPS as INGEST
-from workflows.jobs import Steps, Task, run
+from workflows.jobs import Task, run_all
 from workflows.mattes.cut_out import off_sight
 from workflows.mattes.lobes import transport_of
 from workflows.mattes.perspective import places_of
@@ -132,18 +130,9 @@ def recover(objects: Objects) -> None:
     write_capture(scene, preset("sketch", *MONITOR), file)
     objects.put(uploads.part_path("c", "all"), file.getvalue())
     uploads.seal(objects, "c", [uploads.Part("all", len(file.getvalue()))])
-    _run(INGEST, objects, Task("job", "c", "", {}, LIMITS))
+    run_all(INGEST, objects, Task("job", "c", "", {}, LIMITS))
     for method in ("lobes", "nn-dgsr"):
-        _run(RECOVER, objects, Task("job", "c", method, {"method": method}, LIMITS))
-
-
-def _run(steps: Steps, objects: Objects, task: Task) -> None:
-    """Run all steps of a job."""
-    _, plan = run(steps, objects, task, PREPARE)
-    task = replace(task, plan=plan)
-    for tile in range(plan["tiles"]):
-        run(steps, objects, task, tile)
-    run(steps, objects, task, FINISH)
+        run_all(RECOVER, objects, Task("job", "c", method, {"method": method}, LIMITS))
 
 
 def use_matte(objects: Objects) -> None:

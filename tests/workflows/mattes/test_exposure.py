@@ -1,7 +1,6 @@
 """Mattes of captures whose patterns were exposed so long that what is bright clipped."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +9,9 @@ from imagecodecs import png_encode
 from storage.layout.captures import Stack
 from storage.layout.mattes import Matte
 from storage.objects.store import Objects
-from storage.steps import FINISH, PREPARE
 from workflows.composite import composite
 from workflows.images.resample import area_mean
-from workflows.jobs import Task, run
+from workflows.jobs import Task, run_all
 from workflows.mattes.steps import STEPS
 from workflows.programs.presets import preset
 from workflows.programs.program import Program
@@ -57,10 +55,7 @@ def test_clipped_patterns_still_tell_where_light_comes_from(
     }
     ingest("c", make_zip(manifest, files))
     task = Task("j", "c", "m", {"quality": "fast"}, Limits(1 << 30, 1 << 26))
-    task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
-    for tile in range(task.plan["tiles"]):
-        run(STEPS, objects, task, tile)
-    run(STEPS, objects, task, FINISH)
+    run_all(STEPS, objects, task)
     light = area_mean(backdrop(*MONITOR), *MONITOR)
     made, truth = composite(Matte(objects, "m"), light)[..., :3], scene.truth(light)
     seen = scene.object_mask

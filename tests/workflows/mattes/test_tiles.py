@@ -20,7 +20,7 @@ from tests.parts.captures import nested_program
 from tests.workflows.ingest.video.camera import Camera, capture, film, lights
 from workflows.composite import composite
 from workflows.images.integer_formats import decode, encode_png
-from workflows.jobs import Task, run
+from workflows.jobs import Task, run, run_all
 from workflows.mattes.steps import STEPS
 from workflows.mattes.tiles import cut, cut_inside, mask_of
 from workflows.programs.border import border_light
@@ -292,9 +292,7 @@ def test_exposures_are_merged_by_their_weight(objects: Objects, ingest: Ingest) 
     def error(capture: str, data: bytes) -> float:
         ingest(capture, data)
         task = Task("j", capture, f"m-{capture}", {}, Limits(1 << 30, 1 << 26))
-        task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
-        for tile in range(task.plan["tiles"]):
-            run(STEPS, objects, task, tile)
+        run_all(STEPS, objects, task)
         got = composite(mattes.Matte(objects, task.matte), backdrop)[..., :3]
         return float(np.sqrt(np.mean((got - exact) ** 2)))
 
@@ -333,9 +331,7 @@ def error_of(objects: Objects) -> Callable[..., float]:
 
     def of(capture: str, method: str, backdrop: np.ndarray, picture: np.ndarray, mask: np.ndarray) -> float:
         task = Task("j", capture, f"m-{capture}", {"method": method}, Limits(1 << 30, 1 << 26))
-        task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
-        for tile in range(task.plan["tiles"]):
-            run(STEPS, objects, task, tile)
+        run_all(STEPS, objects, task)
         found = composite(mattes.Matte(objects, task.matte), backdrop)[..., :3]
         return float(np.sqrt(np.mean((found - picture)[mask] ** 2)))
 

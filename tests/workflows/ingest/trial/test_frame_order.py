@@ -3,7 +3,6 @@
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,13 +14,12 @@ from scipy.ndimage import gaussian_filter
 from storage.layout import mattes
 from storage.layout.captures import Stack, _thumbnail
 from storage.objects.store import Objects
-from storage.steps import PREPARE
 from tests.parts.captures import stills_archive
 from workflows.composite import composite
 from workflows.ingest.report.findings import Finding
 from workflows.ingest.report.report import Report, report
 from workflows.ingest.trial.frame_order import check_frames
-from workflows.jobs import Task, run
+from workflows.jobs import Task, run_all
 from workflows.mattes.steps import STEPS
 from workflows.programs.files import fit_to_screen
 from workflows.programs.presets import preset
@@ -246,9 +244,7 @@ def test_recovery_does_without_odd_frames(
     def decibels(frames: Sequence[Codes]) -> float:
         ingest("c", archive(frames, scene))
         task = Task("j", "c", "m", {}, Limits(1 << 30, 1 << 26))
-        task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
-        for tile in range(task.plan["tiles"]):
-            run(STEPS, objects, task, tile)
+        run_all(STEPS, objects, task)
         backdrop = np.random.default_rng(1).random((12, 16, 3), np.float32)
         truth = 0.02 + 0.9 * scene.composite(backdrop)
         error = (composite(mattes.Matte(objects, "m"), backdrop)[..., :3] - truth)[scene.object_mask]

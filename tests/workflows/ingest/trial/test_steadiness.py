@@ -4,7 +4,6 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from scipy.ndimage import zoom
 from storage.layout import mattes
 from storage.layout.captures import Stack
 from storage.objects.store import Objects
-from storage.steps import PREPARE
 from tests.parts.captures import nested_program
 from workflows.composite import composite
 from workflows.images.integer_formats import encode_png
@@ -22,7 +20,7 @@ from workflows.images.resample import area_mean
 from workflows.images.tone_curves import to_light
 from workflows.ingest.report.findings import Finding
 from workflows.ingest.report.report import report
-from workflows.jobs import Task, run
+from workflows.jobs import Task, run_all
 from workflows.mattes.steps import STEPS
 from workflows.mattes.tiles import patterns_of
 from workflows.programs.presets import preset
@@ -87,9 +85,7 @@ def decibels(objects: Objects, ball: Ball, shift: tuple[float, float]) -> float:
     """PSNR of a composite over the ball, where it lies by a shift."""
     scene, _, _, mask = ball
     task = Task("j", "c", "m", {}, Limits(1 << 30, 1 << 26))
-    task = replace(task, plan=run(STEPS, objects, task, PREPARE)[1])
-    for tile in range(task.plan["tiles"]):
-        run(STEPS, objects, task, tile)
+    run_all(STEPS, objects, task)
     y, x = np.mgrid[:240, :320]
     checker = ((y // 24 + x // 24) % 2).astype(np.float32)
     backdrop = np.stack([checker, x.astype(np.float32) / 320, 1 - checker], axis=2)
