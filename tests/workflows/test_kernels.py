@@ -24,7 +24,7 @@ from storage.objects.store import Objects
 from workflows import kernels
 from workflows.composite import composite
 from workflows.composite.live.encode import encode_live
-from workflows.jobs import Task
+from workflows.jobs import Task, run_all
 from workflows.programs.presets import preset
 from workflows.simulation.glass_ball import glass_ball
 from workflows.simulation.scene import write_capture
@@ -35,8 +35,8 @@ for name, depth, method in [("default", 16, "lobes"), ("quick", 8, "lobes"), ("s
     write_capture(glass_ball(20, 18, monitor=(512, 384), rays=4), preset(name, 512, 384), file, depth=depth, mask=True)
     objects.put(uploads.part_path(key, "all"), file.getvalue())
     uploads.seal(objects, key, [uploads.Part("all", len(file.getvalue()))])
-    kernels._run(kernels.INGEST, objects, Task("j", key, "", {}, kernels.LIMITS))
-    kernels._run(kernels.RECOVER, objects, Task("j", key, key, {"method": method}, kernels.LIMITS))
+    run_all(kernels.INGEST, objects, Task("j", key, "", {}, kernels.LIMITS))
+    run_all(kernels.RECOVER, objects, Task("j", key, key, {"method": method}, kernels.LIMITS))
     composite(Matte(objects, key), np.ones((30, 40, 3), np.float32))
     encode_live(Matte(objects, key), threads=1)
 for module in pkgutil.walk_packages(workflows.__path__, "workflows."):
