@@ -59,29 +59,32 @@ def find_covered(
         return False
     before, most = odd_frames(stack.attributes), int(MOST_ODD * stack.frames)
     held: list[int] = []
-    while True:
-        off = np.abs(_off(capture, patterns, sample, found))
+    again: RecoveredSample | None = found
+    while again is not None:
+        off = np.abs(_off(capture, patterns, sample, again))
         far = np.sort(np.nan_to_num(off), axis=1)[:, -SQUARES]
-        if held and far[held[-1]] <= COVERED:
-            break
-        is_off = off > max(OFF, UNUSUAL * float(np.nanmedian(off)))
-        is_off[before + held] = False
-        if np.count_nonzero(is_off) < SQUARES:
-            break
+        worst = _worst(off, before + held)
+        if worst is None or (held and far[held[-1]] <= COVERED):
+            least = max(COVERED, CLEAR * float(np.delete(far, held).max()))
+            held = [frame for frame in held if far[frame] > least]
+            stack.annotate(odd_frames=sorted(before + held))
+            return bool(held)
         if len(held) == most:  # so many are no single accidents
-            held = []
             break
-        held.append(int(np.argmax(np.where(is_off, off**2, 0).sum(axis=1))))
+        held.append(worst)
         stack.annotate(odd_frames=sorted(before + held))
         again = recover_seen(capture, patterns, found.seen, np.zeros(stack.frames))
-        if again is None:
-            held = []
-            break
-        found = again
-    least = max(COVERED, CLEAR * float(np.delete(far, held).max()))
-    held = [frame for frame in held if far[frame] > least]
-    stack.annotate(odd_frames=sorted(before + held))
-    return bool(held)
+    stack.annotate(odd_frames=sorted(before))
+    return False
+
+
+def _worst(off: Doubles, left_out: list[int]) -> int | None:
+    """The frame that is off most, but for those that are left out; None if too few squares are off in all."""
+    is_off = off > max(OFF, UNUSUAL * float(np.nanmedian(off)))
+    is_off[left_out] = False
+    if np.count_nonzero(is_off) < SQUARES:
+        return None
+    return int(np.argmax(np.where(is_off, off**2, 0).sum(axis=1)))
 
 
 def _off(capture: Calibrated, patterns: Patterns, sample: PixelSample, found: RecoveredSample) -> Doubles:
