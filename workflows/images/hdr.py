@@ -25,8 +25,6 @@ TO_SRGB = np.array(
 BAND = 1 << 18
 """Pixels that are converted at a time."""
 TOP = 65535
-
-
 HEADROOM = 1.1
 """Full scale relative to the brightest of a monitor: leaves room for noise and for what compression overshoots."""
 ALL_BUT_OVERSHOOTS = 99.9

@@ -3,7 +3,7 @@
 import io
 import re
 from contextlib import suppress
-from typing import IO, cast
+from typing import IO, Any, cast
 
 import imagecodecs
 import numpy as np
@@ -55,13 +55,11 @@ def orientation(data: bytes) -> int:
     try:
         if data.startswith((b"II", b"MM")):  # Pillow does not open them all
             with tifffile.TiffFile(io.BytesIO(data)) as file:
-                found: int = file.pages[0].tags.valueof(ORIENTATION)
-        else:
-            with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
-                return _orientation_of(picture)
+                return _valid(file.pages[0].tags.valueof(ORIENTATION))
+        with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
+            return _orientation_of(picture)
     except Exception:  # damaged bytes raise many kinds of errors
         return 1
-    return int(found) if found in range(1, 9) else 1
 
 
 def halves_colour(data: bytes) -> bool:
@@ -186,10 +184,14 @@ def _orientation_of(picture: Image.Image) -> int:
     if picture.format == "PNG" and "exif" not in picture.info:
         return 1
     try:
-        found: int = picture.getexif().get(ORIENTATION, 1)
+        return _valid(picture.getexif().get(ORIENTATION))
     except Exception:  # damaged bytes raise many kinds of errors
         return 1
-    return int(found) if found in range(1, 9) else 1
+
+
+def _valid(orientation: Any) -> int:
+    """An orientation that a file states; 1, which is no turn, if there is none like it."""
+    return int(orientation) if orientation in range(1, 9) else 1
 
 
 def _pixels(data: bytes, picture: Image.Image, memory: int) -> NDArray[np.generic]:
