@@ -40,7 +40,7 @@ def found(stack: Stack) -> float:
     return float(np.exp(find_white_excess(capture, lay_out(PROGRAM, "srgb", ()), sample)))
 
 
-@pytest.mark.parametrize("excess", [0.9, 1.15])
+@pytest.mark.parametrize("excess", [0.9, pytest.param(1.15, marks=pytest.mark.slow)])
 def test_excess_is_found(ingest: Ingest, excess: float) -> None:
     stack = stack_of(ingest, excess)
     measured = dict(stack.attributes)
