@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from storage.layout.mattes import Block, Matte
 from workflows.interruption import checkpoint
+from workflows.mattes.lobes import transport_of
 from workflows.recovery.pyramid import Pyramid, bump_variance
+from workflows.recovery.transport import Transport
 
 FIELDS = ("x", "y", "level", "R", "G", "B")
 """The values of a lookup, in this order."""
@@ -27,24 +29,14 @@ _CLUSTER = 7
 
 
 def fit_lookups(
-    columns: int,
-    rows: int,
-    count: NDArray[np.uint32],
-    shared: NDArray[np.bool_],
-    cell: NDArray[np.uint32],
-    weight: NDArray[np.float32],
-    most: int,
-    wanted: NDArray[np.bool_],
-    clusters: int = CLUSTERS,
+    transport: Transport, most: int, wanted: NDArray[np.bool_], clusters: int = CLUSTERS
 ) -> NDArray[np.float32]:
     """Approximate rows of T by a few texture lookups.
 
     Parameters
     ----------
-    columns, rows : int
-        The first grid of the cells.
-    count, shared, cell, weight : arrays
-        T of n pixels, as in :class:`~storage.layout.mattes.Block`, with shapes (n, 3), (n,), (entries,), (entries,).
+    transport : Transport
+        T of n pixels.
     most : int
         Lookups of a pixel.
     wanted : (n,) bool
@@ -68,8 +60,9 @@ def fit_lookups(
     fraction f between two nodes adds ``f (1 - f) 4^l``. A lookup between two levels interpolates their variances.
     A cluster of a single node is exact.
     """
-    pyramid = Pyramid.over(columns, rows)
-    sizes = count.astype(np.int64)
+    pyramid = Pyramid.over(transport.columns, transport.rows)
+    cell, weight, shared = transport.cell, transport.weight, transport.shared
+    sizes = transport.count.astype(np.int64)
     begin = np.concatenate([[0], np.cumsum(sizes.sum(axis=1))])
     capacity = min(max(int(np.diff(begin).max(initial=0)), 1), _MOST_READ)
     lookups = np.zeros((len(sizes), most, len(FIELDS)), np.float32)
@@ -86,17 +79,7 @@ def block_lookups(
 ) -> NDArray[np.float32]:
     """The lookups of the pixels of a block, (h, w, most, 6), as of `fit_lookups`; by default of all pixels."""
     wanted = np.ones(block.recovered.shape, bool) if wanted is None else wanted
-    found = fit_lookups(
-        matte.columns,
-        matte.rows,
-        block.count.reshape(-1, 3),
-        block.shared.reshape(-1),
-        block.cell,
-        block.weight,
-        most,
-        wanted.reshape(-1),
-        clusters,
-    )
+    found = fit_lookups(transport_of(matte, block), most, wanted.reshape(-1), clusters)
     return found.reshape(*block.recovered.shape, most, len(FIELDS))
 
 

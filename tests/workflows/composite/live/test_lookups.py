@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from workflows.composite.live.lookups import fit_lookups
 from workflows.recovery.pyramid import Pyramid
+from workflows.recovery.transport import Transport
 
 COLUMNS, ROWS = 130, 70
 PYRAMID = Pyramid.over(COLUMNS, ROWS)
@@ -24,7 +25,8 @@ def fit(*pixels: tuple[Row, ...], most: int = 4) -> NDArray[np.float32]:
     cell = np.array([one for rows in pixels for row in rows for one in row], np.uint32)
     weight = np.array([w for rows in pixels for row in rows for w in row.values()], np.float32)
     shared = np.array([len(rows) == 1 for rows in pixels])
-    return fit_lookups(COLUMNS, ROWS, count, shared, cell, weight, most, np.ones(len(pixels), bool))
+    transport = Transport(COLUMNS, ROWS, count, cell, weight, shared)
+    return fit_lookups(transport, most, np.ones(len(pixels), bool))
 
 
 def random_row(seed: int, nodes: int) -> Row:
@@ -104,8 +106,8 @@ def test_the_cheapest_mergers_come_first() -> None:
 def test_what_is_not_wanted_is_left_out() -> None:
     row = random_row(1, 9)
     count = np.array([[9, 0, 0]] * 2, np.uint32)
-    given = (np.ones(2, bool), np.array([*row, *row], np.uint32), np.array([*row.values()] * 2, np.float32))
-    lookups = fit_lookups(COLUMNS, ROWS, count, *given, 4, np.array([False, True]))
+    given = np.array([*row, *row], np.uint32), np.array([*row.values()] * 2, np.float32), np.ones(2, bool)
+    lookups = fit_lookups(Transport(COLUMNS, ROWS, count, *given), 4, np.array([False, True]))
     assert not lookups[0].any()
     np.testing.assert_array_equal(lookups[1], fit((row,))[0])
 
@@ -115,7 +117,8 @@ def test_pixel_of_more_nodes_than_are_held_keeps_its_light() -> None:
     cell = np.sort(np.random.default_rng(2).choice(side * side, 50_000, replace=False)).astype(np.uint32)
     count, shared = np.array([[cell.size, 0, 0]], np.uint32), np.array([True])
     weight = np.full(cell.size, 1 / cell.size, np.float32)
-    found = fit_lookups(side, side, count, shared, cell, weight, 4, np.array([True]))[0].astype(np.float64)
+    transport = Transport(side, side, count, cell, weight, shared)
+    found = fit_lookups(transport, 4, np.array([True]))[0].astype(np.float64)
     np.testing.assert_allclose(found[:, 3:].sum(axis=0), 1, atol=1e-4)
     np.testing.assert_allclose(found[:, 3] @ found[:, 0], (cell % side + 0.5).mean(), rtol=1e-4)
     np.testing.assert_allclose(found[:, 3] @ found[:, 1], (cell // side + 0.5).mean(), rtol=1e-4)
