@@ -9,6 +9,7 @@ from itertools import islice
 from sqlalchemy import Connection, Engine, delete, exists, select, update
 
 from storage.database import tables
+from storage.database.dialects import clock
 from storage.database.engine import reading, writing
 from storage.layout import captures, composites, mattes
 from storage.layout import uploads as stored_uploads
@@ -39,7 +40,7 @@ def delete_expired(connection: Connection) -> list[str]:
         what = "capture" if table is tables.captures else "matte"
         used = tables.jobs.c[what]
         busy = select(used).where(jobs.is_in_use(what), used.is_not(None))
-        over = (table.c.expires_at <= time.time(), table.c.state != making, table.c.id.not_in(busy))
+        over = (table.c.expires_at <= clock(), table.c.state != making, table.c.id.not_in(busy))
         some = select(table.c.id).where(*over).limit(MOST)
         found = connection.scalars(delete(table).where(table.c.id.in_(some)).returning(table.c.id))
         gone += [path(one) for one in sorted(found) for path in where]

@@ -210,7 +210,7 @@ def display_url(url: URL) -> str:
 
 
 class clock(FunctionElement[float]):
-    """The database's clock as an SQL expression: seconds since 1970, advancing within a transaction."""
+    """The database's clock as an SQL expression: seconds since 1970, the same throughout a statement."""
 
     type = Float()
     inherit_cache = True
@@ -223,4 +223,4 @@ def _clock_of_sqlite(element: clock, compiler: SQLCompiler, **options: object) -
 
 @compiles(clock, "postgresql")
 def _clock_of_postgresql(element: clock, compiler: SQLCompiler, **options: object) -> str:
-    return "CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS DOUBLE PRECISION)"
+    return "CAST(EXTRACT(EPOCH FROM statement_timestamp()) AS DOUBLE PRECISION)"

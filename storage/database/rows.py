@@ -2,12 +2,12 @@
 
 import json
 import secrets
-import time
 from collections.abc import Container, Iterator
 from typing import Any
 
 from sqlalchemy import Column, Connection, Row, Table, select
 
+from storage.database.dialects import clock
 from storage.errors import NotFound
 
 ROW = 1000
@@ -22,9 +22,12 @@ def new_id() -> str:
     return secrets.token_hex(10)
 
 
-def lifetime(seconds: float | None) -> dict[str, float | None]:
-    """``created_at`` and ``expires_at`` of a row created now; it never expires if `seconds` is None."""
-    now = time.time()
+def lifetime(seconds: float | None) -> dict[str, Any]:
+    """``created_at`` and ``expires_at`` of a row created now; it never expires if `seconds` is None.
+
+    By the database's clock: another machine than the one that creates the row deletes it.
+    """
+    now = clock()
     return {"created_at": now, "expires_at": None if seconds is None else now + seconds}
 
 

@@ -4,13 +4,13 @@ A link ends with a token of 256 random bits, which is shown once; the database k
 """
 
 import secrets
-import time
 from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import Connection, Row, delete, func, insert, select
 
-from storage.database.rows import new_id
+from storage.database.dialects import clock
+from storage.database.rows import lifetime, new_id
 from storage.database.tables import links
 from storage.errors import Conflict, NotFound
 from storage.records.api_keys import hash_of
@@ -30,9 +30,8 @@ def create(connection: Connection, matte: str, seconds: float) -> tuple[str, Row
     of_matte = select(func.count()).select_from(links).where(links.c.matte == matte)
     if connection.scalar(of_matte) >= MOST:  # type: ignore[operator]
         raise Conflict(f"matte {matte} has {MOST} links already: delete one first")
-    token, now = secrets.token_urlsafe(32), time.time()
-    row: dict[str, Any] = {"id": new_id(), "hash": hash_of(token), "matte": matte}
-    row |= {"created_at": now, "expires_at": now + seconds}
+    token = secrets.token_urlsafe(32)
+    row = {"id": new_id(), "hash": hash_of(token), "matte": matte} | lifetime(seconds)
     return token, connection.execute(insert(links).values(row).returning(links)).one()
 
 
@@ -44,7 +43,7 @@ def find(connection: Connection, token: str) -> Row[Any]:
     NotFound
         If there is none, or it has expired.
     """
-    query = select(links).where(links.c.hash == hash_of(token), links.c.expires_at > time.time())
+    query = select(links).where(links.c.hash == hash_of(token), links.c.expires_at > clock())
     row = connection.execute(query).one_or_none()
     if row is None:
         raise NotFound("this link has expired or was deleted: ask the person who sent it for another")
@@ -53,7 +52,7 @@ def find(connection: Connection, token: str) -> Row[Any]:
 
 def list_all(connection: Connection, matte: str) -> Sequence[Row[Any]]:
     """The links to a matte that have not expired, newest first."""
-    query = select(links).where(links.c.matte == matte, links.c.expires_at > time.time())
+    query = select(links).where(links.c.matte == matte, links.c.expires_at > clock())
     return connection.execute(query.order_by(links.c.created_at.desc())).all()
 
 
@@ -72,4 +71,4 @@ def remove(connection: Connection, matte: str, link: str) -> None:
 
 def delete_expired(connection: Connection) -> None:
     """Delete the links that have expired."""
-    connection.execute(delete(links).where(links.c.expires_at <= time.time()))
+    connection.execute(delete(links).where(links.c.expires_at <= clock()))

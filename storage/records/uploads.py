@@ -9,6 +9,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, insert, select, update
 
 from storage.database.dialects import clock
+from storage.database.rows import lifetime
 from storage.database.tables import upload_parts as table
 from storage.database.tables import uploads
 from storage.errors import Conflict, NotFound
@@ -37,10 +38,8 @@ def add(
     key : str, optional
         The client's Idempotency-Key; a key has at most one upload.
     """
-    now = clock()
     row = {"id": upload, "key": key, "offset": 0, "parts": 0, "length": length, "metadata": metadata}
-    times = {"created_at": now, "moved_at": now, "expires_at": now + seconds}
-    connection.execute(insert(uploads).values(row | times))
+    connection.execute(insert(uploads).values(row | {"moved_at": clock()} | lifetime(seconds)))
 
 
 def get(connection: Connection, upload: str) -> Row[Any]:

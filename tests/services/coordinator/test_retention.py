@@ -84,6 +84,17 @@ def test_only_expired_rows_are_deleted(engine: Engine) -> None:
         assert jobs.get(c, "short-r").state == "succeeded"  # the record of its job stays
 
 
+def test_expiry_does_not_depend_on_the_clock_of_the_api(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later = time.time() + 3600
+    with monkeypatch.context() as ahead:
+        ahead.setattr(time, "time", lambda: later)
+        add(engine, "alice", "over", seconds=-1.0)
+    with writing(engine) as c:
+        assert delete_expired(c) == ["captures/over", "uploads/over", "mattes/over"]
+
+
 @pytest.mark.parametrize("kind", ["recover", "composite"])
 @pytest.mark.parametrize("state", ["queued", "running"])
 def test_data_of_an_active_job_does_not_expire(engine: Engine, kind: str, state: str) -> None:
