@@ -1,5 +1,18 @@
-"""`python -m services` is the command `envmatte`, where that is not on the path."""
+"""The command `envmatte`, also as `python -m services` where that is not on the path."""
 
-from services.cli.main import run
+import signal
 
-run()
+
+def run() -> None:
+    """Run a command. Until its modules are imported, Ctrl-C ends the process at once, without a traceback."""
+    if (
+        signal.getsignal(signal.SIGINT) == signal.default_int_handler
+    ):  # a shell has it ignored in the background
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from services.cli.main import run
+
+    run()
+
+
+if __name__ == "__main__":
+    run()

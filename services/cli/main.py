@@ -87,8 +87,8 @@ for command in (
 
 def run() -> None:
     """The entry point: every error becomes a message and an exit code."""
-    # What is half written is removed, as after Ctrl-C. `nohup` has SIGHUP ignored.
-    for number in processes.ENDING:
+    # What is half written is removed at these signals too, as after Ctrl-C. `nohup` has SIGHUP ignored.
+    for number in (signal.SIGINT, *processes.ENDING):
         if signal.getsignal(number) == signal.SIG_DFL:
             signal.signal(number, signal.default_int_handler)
     try:

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -159,3 +160,16 @@ def test_command_ends_without_a_search_for_garbage() -> None:
         [sys.executable, "-c", program, "--version"], capture_output=True, text=True, check=True
     )
     assert int(done.stdout.splitlines()[-1]) < 5000
+
+
+def test_interrupt_while_modules_are_imported_shows_no_traceback() -> None:
+    program = (
+        "import signal, sys\n"
+        "class Interrupt:\n"
+        "    def find_spec(name, *_): name == 'services.client' and signal.raise_signal(signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Interrupt)\n"
+        "from services.__main__ import run\n"
+        "run()"
+    )
+    ended = subprocess.run([sys.executable, "-c", program, "--version"], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (-signal.SIGINT, "")

@@ -13,7 +13,7 @@ from tests.parts.processes import running
 from tests.parts.waiting import until
 from tests.services.cluster.clusters import children, workers
 
-INSTALLED = "import sys; del sys.path[0]; from services.cli.main import run; run()"
+INSTALLED = "import sys; del sys.path[0]; from services.__main__ import run; run()"
 """Runs the command as its script does, for which the working directory is not on the path."""
 ROOT = Path(__file__).parents[3]
 UNWRITABLE = 'mount -t tmpfs -o ro none /dev/shm && exec "$@"'
