@@ -298,6 +298,17 @@ def test_frames_are_browsed_by_keys(desk: Page, service: Service, ready: tuple[s
             expect(desk.get_by_alt_text(f"Frame {frame}", exact=True)).to_be_visible()
 
 
+def test_older_mattes_of_a_capture_are_folded(desk: Page, service: Service, ready: tuple[str, str]) -> None:
+    one = service.http.get(f"/v1/mattes/{ready[1]}").json()
+    some = {"mattes": [one | {"name": f"matte {n}"} for n in range(5)]}
+    desk.route(re.compile(r"/v1/mattes\?capture="), lambda route: route.fulfill(json=some))
+    desk.goto(f"{service.url}/#/captures/{ready[0]}")
+    shown = desk.get_by_role("region", name="Mattes").get_by_role("link")
+    expect(shown).to_have_count(2)
+    desk.get_by_text("3 older").click()
+    expect(shown).to_have_count(5)
+
+
 def test_pictures_of_a_capture_are_fetched_again_after_an_outage(
     desk: Page, service: Service, ready: tuple[str, str]
 ) -> None:

@@ -11,6 +11,8 @@ import { said, t } from "../lib/words.js";
 import { failedFilm } from "../film/failed_film.js";
 import { forgetFilmOf } from "../upload/kept_films.js";
 
+const NEWEST = 2; // mattes that are shown at once: the form for another recovery comes after them
+
 export async function capture(main, signal, id) {
 	const found = await getJson(`v1/captures/${id}`, signal);
 	const problem = h("div");
@@ -46,8 +48,10 @@ export async function capture(main, signal, id) {
 async function mattesOf(id, signal) {
 	const { mattes } = await getJson(`v1/mattes?capture=${id}&limit=8`, signal);
 	const card = matteCards(signal);
+	const cards = (some) => h("ul.list", some.map((one) => h("li", card(one))));
+	const older = mattes.slice(NEWEST);
 	return h("section.stack", { hidden: !mattes.length, "aria-label": t("nav.mattes") }, h("h2", t("capture.mattes")),
-		h("ul.list", mattes.map((one) => h("li", card(one)))));
+		cards(mattes.slice(0, NEWEST)), h("details", { hidden: !older.length }, h("summary", t("capture.older", { n: older.length })), cards(older)));
 }
 
 // The report: a verdict, then what is wrong with its remedies; what is fine is folded.

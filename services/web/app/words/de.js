@@ -45,6 +45,7 @@ export const de = {
 	"capture.lost": "Ihre Bilder werden gelöscht. Matten, die daraus berechnet sind, bleiben.",
 	"capture.mattes": "Ihre Matten",
 	"capture.name": "Name der Aufnahme",
+	"capture.older": "{n} ältere",
 	"capture.reading": "Bilder werden eingelesen",
 	"capture.unnamed": "Aufnahme {id}",
 	"captures.first": "Die erste steht hier, sobald sie hochgeladen ist.",

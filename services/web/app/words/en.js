@@ -45,6 +45,7 @@ export const en = {
 	"capture.lost": "Its frames will be deleted. Mattes recovered from it stay.",
 	"capture.mattes": "Its mattes",
 	"capture.name": "Name of the capture",
+	"capture.older": "{n} older",
 	"capture.reading": "Reading the frames",
 	"capture.unnamed": "Capture {id}",
 	"captures.first": "The first one appears here as soon as it is uploaded.",
