@@ -11,7 +11,7 @@ from services.api.context import Context, authorized
 from services.api.http import errors
 from services.api.http.media_types import refuse_coded_body
 from services.api.jobs import events, jobs
-from services.api.mattes import archives, layers, links, live, mattes
+from services.api.mattes import archives, layers, links, live, mattes, transport
 from services.api.mattes.composites import clips, composites
 from services.api.programs import pattern_files, playback, programs
 from services.api.system import cluster, health, limits, metrics, network, pages, qr_codes
@@ -94,6 +94,7 @@ def build_app(settings: Settings, engine: Engine, objects: Objects) -> FastAPI:
         composites.router,
         archives.router,
         layers.router,
+        transport.router,
         live.router,
         links.router,
         programs.router,
