@@ -7,8 +7,8 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from urllib.parse import SplitResult, urlsplit
 
 from storage.errors import OptionError
@@ -128,36 +128,47 @@ def post(
     port = parts.port or (443 if secure else 80)
     connection = (http.client.HTTPSConnection if secure else http.client.HTTPConnection)(host, port)
     sock = _connect(addresses, port, deadline)
-    timed_out, late = threading.Event(), TimeoutError(f"no complete answer within {seconds:g} s")
-
-    def abort() -> None:  # the socket's own timeout starts again with every byte that comes
-        timed_out.set()
-        with suppress(OSError):
-            socket.socket.shutdown(sock, socket.SHUT_RDWR)
-
-    timer = threading.Timer(deadline - time.monotonic(), abort)
     try:
         if secure:
             context = ssl.create_default_context()
             sock = context.wrap_socket(sock, server_hostname=host, do_handshake_on_connect=False)
-        timer.start()
-        if isinstance(sock, ssl.SSLSocket):
-            sock.do_handshake()
-        connection.sock = sock
-        target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
-        connection.request("POST", target, body, {**headers, "Connection": "close"})
-        status = connection.getresponse().status
+        with _shut_down_at(deadline, sock, TimeoutError(f"no complete answer within {seconds:g} s")):
+            if isinstance(sock, ssl.SSLSocket):
+                sock.do_handshake()
+            connection.sock = sock
+            target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+            connection.request("POST", target, body, {**headers, "Connection": "close"})
+            return connection.getresponse().status
+    finally:
+        connection.close()
+        sock.close()
+
+
+@contextmanager
+def _shut_down_at(deadline: float, sock: socket.socket, late: TimeoutError) -> Iterator[None]:
+    """Shut a socket down if the block has not ended by a deadline, and raise an error then.
+
+    The socket's own timeout starts again with every byte that comes.
+    """
+    timed_out = threading.Event()
+
+    def shut_down() -> None:
+        timed_out.set()
+        with suppress(OSError):
+            socket.socket.shutdown(sock, socket.SHUT_RDWR)
+
+    timer = threading.Timer(deadline - time.monotonic(), shut_down)
+    timer.start()
+    try:
+        yield
     except (OSError, http.client.HTTPException) as error:
         if timed_out.is_set():  # what else goes wrong then follows from that
             raise late from error
         raise
     finally:
         timer.cancel()
-        connection.close()
-        sock.close()
     if timed_out.is_set():
         raise late
-    return status
 
 
 def _split(url: str) -> SplitResult:
