@@ -98,24 +98,9 @@ def create_stack(
     int
         Frames of a slab, which is written at once and is as long as a chunk. Slabs share no chunk, so they can be
         written in any order, by any worker, and repeatedly.
-
-    Notes
-    -----
-    There is one slab, or as few as the memory allows of an even number, so that two workers take equally long. They are
-    of one length but for the last. A chunk is the frames of a slab over a square of pixels. The edge of the square
-    doubles, beginning with that of a block (`block_edge`), until a chunk has about `CHUNK` bytes: a tile reads few
-    chunks, and few bytes that it does not need.
     """
     frames, height, width, channels = shape
-    pixel = channels * dtype.itemsize
-    most = max(1, memory // (2 * height * width * pixel))
-    slabs = -(-frames // most)
-    if slabs > 1:
-        slabs += slabs % 2
-    slab = -(-frames // slabs)
-    edge = block_edge(height, width)
-    while edge < max(height, width) and 2 * slab * edge * edge * pixel <= CHUNK:
-        edge *= 2
+    slab, edge = _slab_and_edge(shape, dtype.itemsize, memory)
     layout = MemoryStore()
     group = zarr.create_group(layout, attributes=attributes)
     stack = group.create_array(
@@ -161,6 +146,26 @@ def create_stack(
             objects.delete(f"{path(capture)}/{name}/c")
     objects.put_tree(path(capture), layout)
     return slab
+
+
+def _slab_and_edge(shape: tuple[int, int, int, int], itemsize: int, memory: int) -> tuple[int, int]:
+    """The frames of a slab, and the edge of the square of pixels that a chunk has of them.
+
+    There is one slab, or as few as the memory allows of an even number, so that two workers take equally long. They are
+    of one length but for the last. The edge doubles, beginning with that of a block (`block_edge`), until a chunk has
+    about `CHUNK` bytes: a tile reads few chunks, and few bytes that it does not need.
+    """
+    frames, height, width, channels = shape
+    pixel = channels * itemsize
+    most = max(1, memory // (2 * height * width * pixel))
+    slabs = -(-frames // most)
+    if slabs > 1:
+        slabs += slabs % 2
+    slab = -(-frames // slabs)
+    edge = block_edge(height, width)
+    while edge < max(height, width) and 2 * slab * edge * edge * pixel <= CHUNK:
+        edge *= 2
+    return slab, edge
 
 
 def _has_other_chunks(objects: Objects, capture: str, stack: zarr.Array[Any]) -> bool:

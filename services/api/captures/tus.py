@@ -167,8 +167,7 @@ def declared(metadata: str) -> dict[str, int]:
     BadHeader
         If one is not a number from 0 to 10**18 - 1.
     """
-    pairs = (pair.strip().partition(" ") for pair in metadata.split(","))
-    texts = {name: base64.b64decode(value) for name, _, value in pairs if name in DECLARED}
+    texts = {name: text for name, text in _values(metadata).items() if name in DECLARED}
     for name, text in texts.items():
         if not (text.isdigit() and len(text) <= 18):
             raise BadHeader(
@@ -180,9 +179,13 @@ def declared(metadata: str) -> dict[str, int]:
 
 def file_name(metadata: str) -> str:
     """The ``filename`` in an ``Upload-Metadata`` that `metadata_of` has checked, without its extension, or nothing."""
-    pairs = dict(pair.strip().partition(" ")[::2] for pair in metadata.split(","))
-    name = base64.b64decode(pairs.get("filename", "")).decode(errors="replace")
+    name = _values(metadata).get("filename", b"").decode(errors="replace")
     return PurePath(CONTROL.sub("", name)).stem[:NAME_LENGTH]
+
+
+def _values(metadata: str) -> dict[str, bytes]:
+    pairs = (pair.strip().partition(" ") for pair in metadata.split(","))
+    return {key: base64.b64decode(value) for key, _, value in pairs}
 
 
 def _base64(text: str, name: str) -> bytes:
