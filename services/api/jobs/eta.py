@@ -11,7 +11,7 @@ from storage.layout.blocks import block_edge
 
 TYPICAL = 8e-8
 """Seconds per unit of `_report_work` on a 2.5 GHz core."""
-TRIAL = 6e7
+TRIAL = 4e7
 """What the trial recovery of a report takes, in the same units: it tries as many pixels, whatever the frames."""
 STEPS = 1.0
 """Seconds that a recovery takes beside those of its pixels: to prepare, and to finish."""
