@@ -76,6 +76,7 @@ def configure_logging(form: str, level: str, role: str) -> None:
     logging.getLogger("alembic").setLevel(logging.WARNING)  # it has an INFO line for every step
     logging.getLogger("uvicorn.error").addFilter(_is_news)
     logging.getLogger("distributed.client").addFilter(_is_an_error)
+    logging.getLogger("distributed.scheduler").addFilter(_is_a_failure)
     sys.excepthook = _log_uncaught
     threading.excepthook = lambda args: logger.critical(
         "thread %s ended by an error", args.thread, exc_info=args.exc_value
@@ -127,6 +128,11 @@ def _is_news(record: logging.LogRecord) -> bool:
 def _is_an_error(record: logging.LogRecord) -> bool:
     """Whether a line of dask's client is about an error: closed while it looks for its scheduler, it was cancelled."""
     return not (record.exc_info and isinstance(record.exc_info[1], CancelledError))
+
+
+def _is_a_failure(record: logging.LogRecord) -> bool:
+    """Whether a line of dask's scheduler is about a failure: of a task whose worker died the coordinator logs more."""
+    return "marked as failed because" not in str(record.msg)
 
 
 def _log_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -206,6 +206,8 @@ def test_task_over_the_memory_limit_is_blamed_at_once(cluster: Cluster, client: 
         with pytest.raises(KilledWorker):
             greedy.result(60)
         until(lambda: workers(process) and workers(process) != before)
+    # The coordinator has it done again.
+    assert "ERROR" not in (cluster.folder / "scheduler.log").read_text()
 
 
 @pytest.mark.slow
