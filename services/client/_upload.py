@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -33,22 +34,11 @@ def send(
         Further fields of the request that creates the capture.
     progress : callable, optional
         Is called with the bytes that the service has, and with all there are.
-
-    Notes
-    -----
-    The Idempotency-Key is a hash of the file's path, size and modification time, so the client stores nothing about
-    the upload.
     """
     from services.client import _session
-    from services.client._declared import declared
 
     state = state_of(file)
-    size = state.st_size
-    mark = f"{file.resolve()} {size} {state.st_mtime_ns}"
-    key = hashlib.sha256(mark.encode(errors="surrogateescape")).hexdigest()
-    create = TUS | {"Upload-Length": str(size), "Idempotency-Key": key}
-    known = declared(file) | {"filename": file.name.encode(errors="replace").decode()}
-    create["Upload-Metadata"] = ",".join(f"{name} {_base64(str(one))}" for name, one in known.items())
+    size, create = state.st_size, _creation_headers(file, state)
     where, offset, step, pause = "", -1, LARGEST, _session.FIRST_PAUSE
     give_up = time.monotonic() + _session.PATIENCE
 
@@ -89,6 +79,21 @@ def send(
                     raise
                 time.sleep(wait)
                 step, pause = max(step // 2, SMALLEST), min(2 * pause, _session.LONGEST_PAUSE)
+
+
+def _creation_headers(file: Path, state: os.stat_result) -> dict[str, str]:
+    """Headers of the request that starts an upload, or finds the one that an earlier call has started.
+
+    The Idempotency-Key is a hash of the file's path, size and modification time, so the client stores nothing about
+    the upload.
+    """
+    from services.client._declared import declared
+
+    mark = f"{file.resolve()} {state.st_size} {state.st_mtime_ns}"
+    key = hashlib.sha256(mark.encode(errors="surrogateescape")).hexdigest()
+    known = declared(file) | {"filename": file.name.encode(errors="replace").decode()}
+    metadata = ",".join(f"{name} {_base64(str(one))}" for name, one in known.items())
+    return TUS | {"Upload-Length": str(state.st_size), "Idempotency-Key": key, "Upload-Metadata": metadata}
 
 
 def _patch(http: "Session", where: str, offset: int, data: bytes) -> "httpx2.Response":

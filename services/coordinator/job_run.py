@@ -202,8 +202,8 @@ class JobRun:
                 again.append(outcome.tile)
                 continue
             try:
-                if self._is_to_repeat(connection, outcome, attempts):
-                    again.append(outcome.tile)
+                self._record_attempt(connection, outcome, attempts)
+                again.append(outcome.tile)
             except EnvmatteError as found:
                 error = error or found
         if error is not None:
@@ -258,8 +258,8 @@ class JobRun:
             jobs.log(connection, self.job, f"waiting for the store: {error.detail}")
         self.blind |= blind
 
-    def _is_to_repeat(self, connection: Connection, outcome: Outcome, attempts: int) -> bool:
-        """Whether a tile without a result is to be done again.
+    def _record_attempt(self, connection: Connection, outcome: Outcome, attempts: int) -> None:
+        """Record why a tile has no result, for it to be done again.
 
         Raises
         ------
@@ -275,26 +275,24 @@ class JobRun:
         if error is not None:
             with about(self.job, tile):
                 logger.warning("failed: %r", error)
-            detail = problem_of(error)["detail"]  # the job shows no more of an unexpected error
-            if tile_records.record_failure(connection, self.job, tile, detail, attempts):
-                return True
-            raise GaveUp(f"{name} failed {attempts} times, last with: {detail}") from error
-        if outcome.starved:  # because of its tile, and it would be again
-            if tile_records.record_failure(
-                connection, self.job, tile, f"its worker {outcome.died} ran out of memory", attempts
-            ):
-                return True
-            raise GaveUp(f"{name} ran out of its worker's memory {attempts} times: {REMEDY}")
-        if outcome.died is not None:
-            if tile_records.record_loss(
-                connection, self.job, tile, f"its worker {outcome.died} died", LOSSES
-            ):
-                return True
-            raise GaveUp(
+            reason = problem_of(error)["detail"]  # the job shows no more of an unexpected error
+            record, allowed = tile_records.record_failure, attempts
+            gave_up = f"{name} failed {attempts} times, last with: {reason}"
+        elif outcome.starved:  # because of its tile, and it would be again
+            reason = f"its worker {outcome.died} ran out of memory"
+            record, allowed = tile_records.record_failure, attempts
+            gave_up = f"{name} ran out of its worker's memory {attempts} times: {REMEDY}"
+        elif outcome.died is not None:
+            reason = f"its worker {outcome.died} died"
+            record, allowed = tile_records.record_loss, LOSSES
+            gave_up = (
                 f"{name}: {LOSSES} workers died while doing it. Either a file makes a decoder hang or crash, or their "
                 f"machines ran out of memory; their logs may say. Send other files, or {REMEDY}"
             )
-        return True
+        else:
+            return
+        if not record(connection, self.job, tile, reason, allowed):
+            raise GaveUp(gave_up) from error
 
     def _enter(
         self, connection: Connection, stage: str, to_do: Sequence[int], task: Task | None = None
