@@ -139,8 +139,23 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
     writer = new_id()
     await _claim(context, row, writer, size)
     reservation = Reservation(context, writer, size, row.length - row.offset, POLL)
-    # A client that falls silent is disconnected, see `services.api.http.slow_clients`.
-    body = reservation.watch(limit.stream(request, row.offset))
+    try:
+        # A client that falls silent is disconnected, see `services.api.http.slow_clients`.
+        await _store(context, row, reservation, limit.stream(request, row.offset), checksum)
+    finally:
+        await anyio.to_thread.run_sync(reservation.release)
+    return await context.call(_get, context, row.id)
+
+
+async def _store(
+    context: Context,
+    row: Row[Any],
+    reservation: Reservation,
+    pieces: AsyncIterator[bytes],
+    checksum: Checksum | None,
+) -> None:
+    """Store a body in parts: record each of them at once, or all of them together once the checksum is right."""
+    body = reservation.watch(pieces)
     stored: list[Part] = []
     offset, more, stopped = row.offset, True, None
     try:
@@ -166,9 +181,6 @@ async def _append(context: Context, request: Request, row: Row[Any], checksum: C
         # Not when cancelled: `_advance` may still be running in its thread. Then the next start removes the parts.
         await anyio.to_thread.run_sync(_remove_unrecorded, context, row.id, stored)
         raise
-    finally:
-        await anyio.to_thread.run_sync(reservation.release)
-    return await context.call(_get, context, row.id)
 
 
 async def _write_part(
