@@ -63,25 +63,31 @@ def dask_setup(worker: Worker) -> None:
     worker.metrics["unconfined_decoders"] = lambda _: lacking  # sent with every heartbeat
     if lacking:
         logger.warning("%s", lacking)
-    since: dict[str, float] = {}
+    # Not one of the worker's own callbacks, which stop when it begins to close.
+    PeriodicCallback(_Strays(worker).look, 1000 * POLL).start()
 
-    async def end_strays() -> None:
-        now = time.monotonic()
+
+class _Strays:
+    """Tasks that run in a worker although they are no longer wanted, and since when."""
+
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
+        self._since: dict[str, float] = {}
+
+    async def look(self) -> None:
+        """Look for them, and end this process if one has run for too long."""
+        worker, now = self._worker, time.monotonic()
         ending = worker.status in ENDING
         strays = {task.key for task in worker.state.executing if ending or task.state == "cancelled"}
-        for key in since.keys() - strays:
-            del since[key]
-        for key in strays:
-            if now - since.setdefault(key, now) > PATIENCE:
+        self._since = {key: self._since.get(key, now) for key in strays}
+        for key, since in self._since.items():
+            if now - since > PATIENCE:
                 found = read_key(key)
                 with about(*found) if found else nullcontext():
                     logger.info("ending this process: its task was cancelled and still runs")
                 if not ending:
                     await _leave(worker)
                 os._exit(1)
-
-    # Not one of the worker's own callbacks, which stop when it begins to close.
-    PeriodicCallback(end_strays, 1000 * POLL).start()
 
 
 async def dask_teardown(worker: Worker) -> None:
