@@ -24,7 +24,7 @@ from workflows.images.resample import area_mean
 from workflows.images.tone_curves import from_light, to_light
 from workflows.programs.presets import preset
 from workflows.simulation import glass_ball
-from workflows.simulation.scene import write_capture
+from workflows.simulation.scene import Scene, write_capture
 from workflows.untrusted.confinement import end_with_parent
 
 WIDTH, HEIGHT = 240, 180
@@ -92,11 +92,16 @@ def run(
             keep.mkdir(parents=True, exist_ok=True)
             shutil.copy(capture, keep)
             (keep / "backdrop.png").write_bytes(encoded)
+    picture, psnr = _compare(scene, backdrop, answer)
+    return picture, {"psnr_db": psnr, "object_pixels": int(scene.object_mask.sum()), **times}
 
-    truth = scene.truth(backdrop)
+
+def _compare(scene: Scene, backdrop: NDArray[np.float32], answer: bytes) -> tuple[bytes, float]:
+    """A PNG of backdrop, composite, truth and error side by side, and the PSNR of the composite in linear light."""
+    truth = np.clip(scene.truth(backdrop), 0, 1)
     composite = integer_formats.to_unit(integer_formats.decode(answer, memory=1 << 28))
-    shown = from_light(np.clip(truth, 0, 1), "srgb")
-    error = np.mean((to_light(composite, "srgb") - np.clip(truth, 0, 1))[scene.object_mask] ** 2)
+    shown = from_light(truth, "srgb")
+    error = np.mean((to_light(composite, "srgb") - truth)[scene.object_mask] ** 2)
     psnr = round(float(-10 * np.log10(error)), 2)
     panels = {
         "backdrop": from_light(area_mean(backdrop, *PANEL), "srgb"),
@@ -104,7 +109,7 @@ def run(
         "truth": shown,
         f"error x {ERROR_GAIN}": np.abs(composite - shown) * ERROR_GAIN,
     }
-    return _side_by_side(panels), {"psnr_db": psnr, "object_pixels": int(scene.object_mask.sum()), **times}
+    return _side_by_side(panels), psnr
 
 
 @contextmanager
