@@ -6,6 +6,7 @@ import shutil
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -106,9 +107,13 @@ def test_every_call_reports_unreachable_bucket(unreachable: str) -> None:
         lambda: zarr.create_array(objects.zarr, name="a", data=array),
         lambda: zarr.open_group(objects.zarr, path="a"),
     ]
-    for request in requests:
+
+    def attempt(request: Callable[[], object]) -> None:
         with pytest.raises(Unavailable, match=r"try again later \((HTTP error: [a-z ]+|status code: \d+)\)"):
             request()
+
+    with ThreadPoolExecutor(len(requests)) as threads:  # one after another they would wait for seconds
+        list(threads.map(attempt, requests))
 
 
 def test_bucket_that_disconnects_during_read(impatient: None, s3: str) -> None:
