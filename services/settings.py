@@ -207,22 +207,10 @@ class CoordinatorSettings(ClusterSettings):
     @field_validator("database")
     @classmethod
     def _check_database(cls, value: str | None) -> str | None:
-        if value is None:
-            return value
-        from sqlalchemy import make_url
-        from sqlalchemy.exc import ArgumentError
+        if value is not None:
+            from storage.database.dialects import parse_url
 
-        try:
-            url = make_url(value)
-        except ArgumentError:
-            kind = file = ""
-        else:
-            kind, file = url.get_backend_name(), url.database or ""
-        # SQLite would make a database in memory, or wherever it was started.
-        if kind == "sqlite" and not Path(file).is_absolute():
-            raise ValueError("must name its file from the root on, with four slashes: sqlite:////FILE")
-        if kind not in ("sqlite", "postgresql"):  # without showing the URL, which may hold a password
-            raise ValueError("must be postgresql://USER:PASSWORD@HOST/NAME or sqlite:////FILE")
+            parse_url(value)
         return value
 
     @field_validator("store")

@@ -66,25 +66,45 @@ _SQLITE_UNAVAILABLE = {
 _POSTGRESQL_UNAVAILABLE = {"25P03", "25006"}
 
 
-def make_engine(url: str) -> Engine:
-    """An engine for a URL, configured for its kind of database; it connects on first use.
+def parse_url(url: str) -> URL:
+    """The URL of a database, as SQLAlchemy takes it.
 
     Raises
     ------
-    InvalidInput
-        If the URL does not name a SQLite or PostgreSQL database.
+    ValueError
+        If it is not that of a SQLite file or a PostgreSQL database; says what it must be.
     """
     try:
         parsed = make_url(url)
         name = parsed.get_backend_name()
     except (ArgumentError, ValueError):
         name = ""
+    # SQLite would make a database in memory, or wherever the process was started.
+    if name == "sqlite" and not Path(parsed.database or "").is_absolute():
+        raise ValueError("must name its file from the root on, with four slashes: sqlite:////FILE")
+    if name not in ("sqlite", "postgresql"):  # without showing the URL, which may hold a password
+        raise ValueError("must be postgresql://USER:PASSWORD@HOST/NAME or sqlite:////FILE")
+    return parsed
+
+
+def make_engine(url: str) -> Engine:
+    """An engine for a URL, configured for its kind of database; it connects on first use.
+
+    Raises
+    ------
+    InvalidInput
+        If the URL is none that `parse_url` takes.
+    """
+    try:
+        parsed = parse_url(url)
+    except ValueError as error:
+        raise InvalidInput(f"the database's URL {error}") from error
     # Programs may be large: `json.loads` takes three times as long, in which no other thread runs.
-    if name == "sqlite":
+    if parsed.get_backend_name() == "sqlite":
         engine = create_engine(parsed, json_deserializer=from_json)
         event.listen(engine, "connect", _set_up_sqlite)
         event.listen(engine, "connect", _make_private)
-    elif name == "postgresql":
+    else:
         engine = create_engine(
             parsed.set(drivername="postgresql+psycopg"),
             json_deserializer=from_json,
@@ -93,10 +113,6 @@ def make_engine(url: str) -> Engine:
             connect_args={name: value for name, value in CONNECTION.items() if name not in parsed.query},
         )
         event.listen(engine, "connect", _set_up_postgresql)
-    else:  # do not repeat the URL: it may contain a password
-        raise InvalidInput(
-            "the database's URL must be sqlite:////folder/file.db or postgresql://user:password@host:port/database"
-        )
     event.listen(engine, "begin", _begin)
     return engine
 

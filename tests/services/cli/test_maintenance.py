@@ -36,7 +36,7 @@ def test_a_store_that_is_not_mounted_is_named_rather_than_all_that_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    engine = open_engine("sqlite:///envmatte.db")
+    engine = open_engine(f"sqlite:///{tmp_path}/envmatte.db")
     installation.recognise(engine, Objects((tmp_path / "store").as_uri()))
     engine.dispose()
     place = ("--data", str(tmp_path), "--store", (tmp_path / "unmounted").as_uri())

@@ -65,9 +65,19 @@ def test_postgresql_settings(postgresql: str) -> None:
     "url", ["", "here", "mysql://user:secret@host/name", "postgresql://host:secret/name"]
 )
 def test_unsupported_url_is_refused_without_repeating_it(url: str) -> None:
-    with pytest.raises(InvalidInput, match="must be sqlite:") as caught:
+    with pytest.raises(InvalidInput, match="must be postgresql:") as caught:
         open_engine(url)
     assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("url", ["sqlite://", "sqlite:///:memory:", "sqlite:///here.db"])
+def test_file_of_sqlite_is_named_from_the_root_on(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InvalidInput, match="four slashes"):
+        open_engine(url)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_clock_advances_within_a_transaction(engine: Engine) -> None:
