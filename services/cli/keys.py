@@ -11,7 +11,7 @@ import click
 
 from services.cli import options
 from services.cli.options import as_json, drop_unset
-from services.cli.output import example, print_result
+from services.cli.output import example, print_result, print_summary
 from storage.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def revoke(name: str, as_json: bool, **given: Any) -> None:
         click.echo(
             "no key is left in the database, and requests still need one: `envmatte keys make NAME`", err=True
         )
-    click.echo(json.dumps({"name": name, "revoked": True}, indent=2) if as_json else f"{name}: revoked")
+    print_summary({"name": name, "revoked": True}, as_json, f"{name}: revoked")
 
 
 def _time(seconds: float | None) -> str | None:

@@ -27,8 +27,8 @@ def print_output(output: Path, as_json: bool) -> None:
 
 
 def print_summary(result: Mapping[str, Any], as_json: bool, summary: str) -> None:
-    """Print a result as JSON, with a summary, or the summary alone."""
-    print_result({**result, "told": summary}, as_json, "told")
+    """Print a result as JSON, or a summary of it."""
+    click.echo(json.dumps(result, indent=2) if as_json else summary)
 
 
 def write(path: Path, data: bytes) -> None:

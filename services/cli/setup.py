@@ -1,6 +1,5 @@
 """The commands of `envmatte` that prepare an installation: certificates of a cluster, compiled kernels."""
 
-import json
 from pathlib import Path
 
 import click
@@ -45,7 +44,7 @@ def warm(as_json: bool) -> None:
     result = {"cache": str(done.cache), "kernels": done.kernels, "compiled": done.compiled}
     result["seconds"] = round(done.seconds, 1)
     summary = f"{done.compiled} kernels compiled in {done.seconds:.1f} s, kept in {done.cache}"
-    click.echo(json.dumps(result, indent=2) if as_json else summary)
+    print_summary(result, as_json, summary)
 
 
 COMMANDS = (certs, warm)
