@@ -182,7 +182,7 @@ def test_half_an_interval_is_the_formula(dense: Dense) -> None:
         return (rho * np.einsum("yxcl,lc->yxc", T.astype(np.float64), light)) @ np.transpose(CROSSTALK)
 
     C, white = S + arrived(nodes(mean)), arrived(np.ones((NODES, 3), np.float32))
-    variance = 0.3 * white * arrived(W) + 1e-4 + 2e-3 * C + 0.01 * white**2
+    variance = 0.3 * (white * arrived(W)) ** 0.75 + 1e-4 + 2e-3 * C + 0.01 * white**2
     light = light_on(matte, Backdrop(backdrop), None, 1)
     contrast = contrast_on(matte, light, Backdrop(backdrop.copy()), None, 1)
     interval = Interval(contrast=0.3, read=1e-4, shot=2e-3, share=0.01)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from workflows.recovery.camera.noise import NoiseModel
-from workflows.recovery.interval import Interval, fit_interval, local_contrast
+from workflows.recovery.interval import GROWTH, POWER, Interval, fit_interval, local_contrast
 from workflows.recovery.pyramid import Pyramid
 
 NOISE = NoiseModel(1e-5, 1e-4)
@@ -37,11 +37,11 @@ def test_contrast_within_cells_counts() -> None:
 @pytest.mark.parametrize("further", [0.0, 4e-4])
 def test_interval_holds_what_it_was_fitted_to(further: float) -> None:
     rng = np.random.default_rng(0)
-    contrast = rng.random(20_000) ** 4 / 4
+    contrast = rng.random(20_000) ** 8 / 4  # a fifth has next to none
     variance = NOISE.variance(rng.random(contrast.size))
-    spread = np.sqrt(0.02 * contrast + variance + further)
+    spread = np.sqrt(0.02 * contrast**POWER + variance + further)
     found = fit_interval(
-        spread * rng.standard_normal(contrast.size), contrast, variance, 0.5, NOISE, 140, (0, 0)
+        spread * rng.standard_normal(contrast.size), contrast, variance, 0.5, NOISE, 140, (0, 0), 0
     )
     assert found.contrast == pytest.approx(0.02, rel=0.1)
     assert found.read == pytest.approx(NOISE.read * 2.5 / 140)
@@ -55,9 +55,22 @@ def test_interval_holds_what_it_was_fitted_to(further: float) -> None:
 def test_errors_of_the_model_count_in_proportion() -> None:
     rng = np.random.default_rng(0)
     error, contrast = 1e-3 * rng.standard_normal(1000), rng.random(1000)
-    found = fit_interval(error, contrast, np.full(1000, 1e-6), 0.5, NOISE, 100, (0.04, 0.03))
+    found = fit_interval(error, contrast, np.full(1000, 1e-6), 0.5, NOISE, 100, (0.04, 0.03), 0)
     assert found.share == pytest.approx(0.03**2 + 0.04**2 * 2.5 / 100)
     assert found.contrast < 1e-9
+
+
+def test_errors_are_smaller_when_no_pattern_is_held_out_and_noise_is_not() -> None:
+    rng = np.random.default_rng(0)
+    contrast = rng.random(5000) / 4
+    error = np.sqrt(0.02 * contrast**POWER + 1e-4) * rng.standard_normal(5000)
+    all_used, some_used = (
+        fit_interval(error, contrast, np.full(5000, 1e-7), 0.5, NOISE, 100, (0, 0), held_out)
+        for held_out in (0, 0.1)
+    )
+    assert some_used.contrast == pytest.approx(0.9**GROWTH * all_used.contrast)
+    assert some_used.share == pytest.approx(0.9**GROWTH * all_used.share)
+    assert (some_used.read, some_used.shot) == (all_used.read, all_used.shot)
 
 
 def test_errors_too_large_for_their_contrast_are_a_share_of_the_light() -> None:
@@ -65,7 +78,7 @@ def test_errors_too_large_for_their_contrast_are_a_share_of_the_light() -> None:
     contrast = np.where(rng.random(5000) < 0.3, 1e-6, 1e-5)
     spread = np.where(contrast < 5e-6, 1e-3, 0.1)
     error = spread * rng.standard_normal(5000)
-    found = fit_interval(error, contrast, np.full(5000, 1e-7), 0.5, NOISE, 100, (0, 0))
+    found = fit_interval(error, contrast, np.full(5000, 1e-7), 0.5, NOISE, 100, (0, 0), 0)
     assert found.contrast == 0
     half = found.half_width(np.zeros(5000, np.float32), np.float32(0.5), contrast.astype(np.float32))
     assert np.mean(np.abs(error) <= half) == pytest.approx(0.9, abs=0.02)

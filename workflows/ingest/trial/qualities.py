@@ -164,7 +164,8 @@ def _intervals(
         if not is_held_out:
             leverage = np.clip(_leverage(made, predicted, shown), 0, MOST_LEVERAGE)
             error /= 1 - leverage[:, np.newaxis]
-        intervals[name] = _interval(capture, made[0], error, predicted[0], tested, chosen)
+        share = 0.0 if held_out is None else float(held_out.mean())
+        intervals[name] = _interval(capture, made[0], error, predicted[0], tested, chosen, share)
     return intervals
 
 
@@ -205,6 +206,7 @@ def _interval(
     predicted: _Prediction,
     tested: NDArray[np.bool_],
     chosen: NDArray[np.intp],
+    held_out: float,
 ) -> Interval | None:
     """The interval by the errors of what a recovery predicts of some patterns; None if too little was seen of these."""
     stack, program, _ = capture
@@ -225,6 +227,7 @@ def _interval(
         noise,
         float(np.median(found.light.worth[:, program.measured].sum(axis=1))),
         (model_error, float(attributes["smooth_error"])),
+        held_out,
     )
     if program.in_colour and attributes.get("half_colour"):
         fitted = fitted.wider(COLOURED)
