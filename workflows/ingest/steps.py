@@ -288,6 +288,7 @@ def finish(objects: Objects, task: Task) -> dict[str, Any]:
     stack = Stack(objects, task.capture)
     border = BorderValues.of(stack)
     check_frames(stack, border)
+    stack.annotate(white_balance=None)  # a retried ingest must not find an old one
     calibrate(stack, border)
     seconds = _try_out(stack, border)
     survey(stack, border)

@@ -129,12 +129,22 @@ class BorderValues:
         places = np.stack(np.meshgrid(rows, columns, indexing="ij")).reshape(2, -1)
         return codes[:, kept], places[:, kept], whole[np.newaxis, kept]
 
-    def exposures(self, look_up: NDArray[np.float32], local: Surroundings | None = None) -> Doubles | None:
+    def exposures(
+        self,
+        look_up: NDArray[np.float32],
+        local: Surroundings | None = None,
+        balance: Doubles | None = None,
+    ) -> Doubles | None:
         """The exposure of each frame, as of `fit`."""
-        found = self.fit(look_up, local)
+        found = self.fit(look_up, local, balance)
         return None if found is None else found.exposure
 
-    def fit(self, look_up: NDArray[np.float32], local: Surroundings | None = None) -> BorderLight | None:
+    def fit(
+        self,
+        look_up: NDArray[np.float32],
+        local: Surroundings | None = None,
+        balance: Doubles | None = None,
+    ) -> BorderLight | None:
         """The exposure of each frame and the border's light; None if too few values see the border.
 
         Parameters
@@ -143,6 +153,8 @@ class BorderValues:
             The light of each code.
         local : Surroundings, optional
             The local gain of tone mapping, as from `workflows.ingest.light.local_gain.local_gain`.
+        balance : (frames, 3) float64, optional
+            As from `workflows.ingest.light.stack_attributes.white_balance_of`.
 
         Notes
         -----
@@ -154,7 +166,10 @@ class BorderValues:
         """
         if self.codes.shape[1] < MIN_VALUES:
             return None
-        light = light_of_codes(self.codes, look_up).mean(axis=2, dtype=np.float64)
+        coloured = light_of_codes(self.codes, look_up)
+        if balance is not None:
+            coloured /= balance[:, np.newaxis].astype(np.float32)
+        light = coloured.mean(axis=2, dtype=np.float64)
         if local is not None:
             light /= local.at(*self.places)
         frames, terms = self.design.shape

@@ -22,7 +22,12 @@ from workflows.ingest.camera.lit import find_lit
 from workflows.ingest.camera.sample import FRAMES, FilmedPixels, HalftoneCodes, Sample
 from workflows.ingest.camera.stated_exposure import automatic_exposures
 from workflows.ingest.light.local_gain import Surroundings, local_gain
-from workflows.ingest.light.stack_attributes import clipped_from, exposures_of, program_of
+from workflows.ingest.light.stack_attributes import (
+    clipped_from,
+    exposures_of,
+    program_of,
+    white_balance_of,
+)
 from workflows.programs.program import Program
 from workflows.recovery.camera.noise import NoiseModel, estimate_excess
 from workflows.recovery.camera.photometry import estimate_crosstalk, estimate_noise
@@ -78,7 +83,7 @@ def calibrate(
     Parameters
     ----------
     stack : Stack
-        Annotated with the results, but not saved.
+        Annotated with the results, but not saved. A ``white_balance`` that it has is undone.
     border : BorderValues, optional
         Of a film with a border.
     gains : sequence of float, optional
@@ -90,11 +95,11 @@ def calibrate(
     sample = Sample(stack, find_lit(stack, program))
     filmed = sample.every_frame()
     stack.annotate(tone_mapping=tone_mapping, clipped_from=_clipped_from(stack, filmed))
-    gain = local_gain(stack)
+    gain, balance = local_gain(stack), white_balance_of(stack.attributes)
     constants = constant_frames(stack, program)
     codes = np.ascontiguousarray(sample.codes(constants.frames).transpose(1, 0, 2))
     usable = (codes > 0) & (codes < clipped_from(stack))
-    camera, exposed, scaled = _camera(stack, program, sample, border, gain)
+    camera, exposed, scaled = _camera(stack, program, sample, border, gain, balance)
     curves = _estimate_curves(stack, program, camera, constants, codes, usable)
     camera = curves.camera if camera == "unknown" else camera
     # Only one exposure, so that all frames have the same noise.
@@ -103,8 +108,10 @@ def calibrate(
     top, black = np.iinfo(stack.dtype).max, stack.attributes["storage"]["black"]
     look_up = table(camera, stack.dtype, black)
     light, shown = light_of_codes(codes, look_up), to_light(constants.sent, curves.monitor)
-    if exposed is not None:
-        light /= exposed[constants.frames, np.newaxis].astype(np.float32)
+    changed = np.ones((stack.frames, 1)) if exposed is None else exposed[:, np.newaxis]
+    if balance is not None:
+        changed = changed * balance
+    light /= changed[constants.frames].astype(np.float32)
     if gain is not None:
         light /= gain.at(*sample.places)[constants.frames].T[..., np.newaxis]
     if gains is not None:
@@ -116,7 +123,7 @@ def calibrate(
     if filmed is not None and not is_free(exposed):
         whole = (filmed.codes > 0) & (filmed.codes < clipped_from(stack))
         compressed = _noise_of_film(
-            filmed.light(look_up, gain, exposed), whole, constants.frames, shown.mean(axis=1)
+            filmed.light(look_up, gain, changed), whole, constants.frames, shown.mean(axis=1)
         )
         # Compression makes noise larger only.
         if compressed is not None and compressed.variance(_GREY) >= noise.variance(_GREY):
@@ -162,6 +169,7 @@ def _camera(
     sample: Sample,
     border: BorderValues | None,
     gain: Surroundings | None,
+    balance: NDArray[np.float64] | None,
 ) -> tuple[CameraCurve | Literal["unknown"], NDArray[np.float64] | None, bool]:
     """The camera's curve, or that of each channel; the exposure of each frame by a film's border, or as stills state
     it, (frames,), if it varied; whether the monitor showed the patterns at another size.
@@ -180,7 +188,7 @@ def _camera(
             "srgb" if camera == "unknown" else camera, stack.dtype, stack.attributes["storage"]["black"]
         )
         if border:
-            exposed = border.exposures(look_up, gain)
+            exposed = border.exposures(look_up, gain, balance)
         seen = halftones and halftones.exposed(np.ones(stack.frames) if exposed is None else exposed)
         if stated:
             scaled = seen is not None and are_scaled(seen, look_up)

@@ -12,7 +12,7 @@ from workflows.ingest.camera.border_exposure import is_free
 from workflows.ingest.camera.curve import HalfTones, Shown
 from workflows.ingest.camera.lit import windows
 from workflows.ingest.light.local_gain import Surroundings, local_gain
-from workflows.ingest.light.stack_attributes import shortest_frames
+from workflows.ingest.light.stack_attributes import shortest_frames, white_balance_of
 from workflows.programs.program import Program
 
 SAMPLES = 20_000
@@ -78,14 +78,13 @@ class FilmedPixels(NamedTuple):
     places: NDArray[np.intp]
 
     def light(
-        self, look_up: NDArray[np.float32], gain: Surroundings | None, exposed: NDArray[np.float64] | None
+        self, look_up: NDArray[np.float32], gain: Surroundings | None, changed: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Their light as of usual exposure and without local gain, like the codes."""
+        """Their light, without local gain and what else has ``changed``, (frames, 1 or channels), like the codes."""
         light = light_of_codes(self.codes, look_up)
         if gain is not None:
             light /= gain.at(*self.places).T[..., np.newaxis]
-        if exposed is not None:
-            light /= exposed[:, np.newaxis].astype(np.float32)
+        light /= changed.astype(np.float32)
         return light
 
 
@@ -105,7 +104,7 @@ class HalftoneCodes(NamedTuple):
     codes : list of (k, n) float32
         Values of n pixels and channels in each of them, 0 to 1.
     gain : (frames, n) float64 or None
-        The local gain in all frames of the stack.
+        The local gain, and that of the white balance, in all frames of the stack.
     shares : list of float
         The share of white's light that each half-tone has.
     """
@@ -132,11 +131,14 @@ class HalftoneCodes(NamedTuple):
         every = np.concatenate(frames)
         full = np.float32(np.iinfo(stack.dtype).max)
         values = sample.codes(every.tolist()).reshape(every.size, -1).astype(np.float32) / full
-        gain = local_gain(stack)
+        local, balance = local_gain(stack), white_balance_of(stack.attributes)
+        gain = None if local is None else np.repeat(local.at(*sample.places), 3, axis=1).astype(np.float64)
+        if balance is not None:
+            gain = (1.0 if gain is None else gain) * np.tile(balance, sample.places.shape[1])
         return cls(
             frames,
             np.split(values, np.cumsum([some.size for some in frames])[:-1]),
-            None if gain is None else np.repeat(gain.at(*sample.places), 3, axis=1).astype(np.float64),
+            gain,
             [share for _, share in tones],
         )
 

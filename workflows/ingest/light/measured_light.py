@@ -26,9 +26,11 @@ FrameOf = Callable[[int], tuple[Floats, Bools]]
 
 
 def even_out(light: Floats, frame: int, attributes: dict[str, Any]) -> Floats:
-    """The light of a frame as in one of usual exposure, if the camera's exposure changed by itself."""
-    exposed = attributes.get("auto_exposure")
-    return light if exposed is None else light / np.float32(exposed[frame])
+    """The light of a frame, (..., channels), as of usual exposure and white balance, if the camera's changed."""
+    for changed in (attributes.get("auto_exposure"), attributes.get("white_balance")):
+        if changed is not None:
+            light = light / np.float32(changed[frame])
+    return light
 
 
 def read_light(

@@ -42,6 +42,12 @@ def exposures_of(attributes: dict[str, Any]) -> Floats:
     return exposures
 
 
+def white_balance_of(attributes: dict[str, Any]) -> NDArray[np.float64] | None:
+    """Gains of the channels in each frame, (frames, 3), as of `workflows.ingest.camera.white_balance`."""
+    found = attributes.get("white_balance")  # missing from captures of earlier versions
+    return None if found is None else np.array(found)
+
+
 def shortest_frames(attributes: dict[str, Any], numbers: NDArray[np.intp]) -> NDArray[np.intp]:
     """The frames of some patterns in the shortest exposure."""
     return np.flatnonzero(np.isin(attributes["patterns"], numbers) & (exposures_of(attributes) == 1))

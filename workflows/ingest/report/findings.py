@@ -52,6 +52,7 @@ def findings(figures: Figures, program: Program, attributes: dict[str, Any]) -> 
         _auto_exposure(
             attributes.get("auto_exposure"), costs["auto_exposure"], filmed=figures.video is not None
         ),
+        _white_balance(attributes.get("white_balance")),
         _tone_mapping(attributes.get("tone_mapping")),
         _steadiness(attributes),
         _drift(figures.drift),
@@ -231,6 +232,20 @@ def _auto_exposure(exposed: list[float] | None, cost: float, *, filmed: bool) ->
             if level == "bad"
             else ""
         ),
+    )
+
+
+def _white_balance(gains: list[list[float]] | None) -> Finding | None:
+    """A white balance that hardly changed is not reported: recovery does not follow it either."""
+    if not gains:
+        return None
+    most = float((np.max(gains, axis=0) / np.min(gains, axis=0)).max()) - 1
+    return Finding(
+        name="white_balance",
+        level="warning",
+        message=f"the camera's white balance changed by {100 * most:.0f} % while the patterns were shown: recovery "
+        "follows it, and composites have the one that it began with",
+        remedy="lock white balance before the first frame",
     )
 
 

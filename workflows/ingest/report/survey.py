@@ -133,8 +133,8 @@ class _Windows:
         y, x = np.mgrid[rows, columns].reshape(2, -1)
 
         def evened(codes: Codes, frame: int) -> NDArray[np.float32]:
-            light = light_of_codes(codes, self._look_up).mean(axis=2)
-            light = even_out(light, frame, self._stack.attributes)
+            every = even_out(light_of_codes(codes, self._look_up), frame, self._stack.attributes)
+            light: NDArray[np.float32] = every.mean(axis=2)
             return light if self._gain is None else light / self._gain.at(y, x, frame).reshape(light.shape)
 
         kept = self._read(rows, columns, wanted)

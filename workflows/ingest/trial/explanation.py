@@ -7,9 +7,15 @@ import numpy as np
 from storage.layout.captures import Stack
 from workflows.ingest.camera.border_exposure import BorderLight, BorderValues, is_free
 from workflows.ingest.camera.calibration import calibrate
+from workflows.ingest.camera.white_balance import fit_white_balance
 from workflows.ingest.light.local_gain import local_gain
-from workflows.ingest.light.stack_attributes import look_up_of, monitor_curve_of
-from workflows.ingest.pixel_sample import PixelSample, take_sample
+from workflows.ingest.light.stack_attributes import (
+    exposures_of,
+    look_up_of,
+    monitor_curve_of,
+    white_balance_of,
+)
+from workflows.ingest.pixel_sample import PixelSample, see_sample, take_sample
 from workflows.ingest.trial.covered import find_covered
 from workflows.ingest.trial.tone_mapping import find_tone_mapping
 from workflows.ingest.trial.trial_recovery import Calibrated
@@ -20,6 +26,9 @@ from workflows.recovery.sensing import Patterns
 
 TONE_MAPPING_TURNS = 2
 """Turns in which local tone mapping is found, and corrected: T has explained some of it before it is."""
+WHITE_BALANCE_TURNS, SETTLED = 8, 0.002
+"""Turns, at most, in which the white balance is found and corrected: the camera's curve, black and white are measured
+from frames of several. They end when no gain changes by a larger share."""
 
 
 class Explained(NamedTuple):
@@ -45,7 +54,8 @@ class Explained(NamedTuple):
 def explain(
     stack: Stack, program: Program, sample: PixelSample, border: BorderValues | None
 ) -> Explained | None:
-    """Find the frames in which something covers a part of the object, and what T leaves unexplained without them.
+    """Find how the white balance changed, the frames in which something covers a part of the object, and what T leaves
+    unexplained without them.
 
     Returns
     -------
@@ -54,6 +64,7 @@ def explain(
     """
     # The bare monitor tells what a camera does better than glass, whose T explains some of it.
     wide = sample if stack.mask().all() else take_sample(stack, masked=False) or sample
+    _follow_white_balance(stack, program, wide, border)
     found = _explain(stack, program, sample, wide, border)
     if found is not None and find_covered(
         found.capture, found.unexplained.patterns, sample, found.unexplained.recovered
@@ -102,6 +113,27 @@ def _explain(
     return None if found is None else Explained(capture, light, wide, found)
 
 
+def _follow_white_balance(
+    stack: Stack, program: Program, sample: PixelSample, border: BorderValues | None
+) -> None:
+    """Find how the white balance changed, annotate the stack with it as ``white_balance``, and calibrate it again.
+
+    Patterns in colour don't tell it.
+    """
+    if stack.channels == 1 or program.channels(stack.images()) > 1:
+        return
+    patterns = np.array(stack.attributes["patterns"])
+    exposures = exposures_of(stack.attributes)[:, np.newaxis, np.newaxis]
+    for _ in range(WHITE_BALANCE_TURNS):
+        known = white_balance_of(stack.attributes)
+        seen = see_sample(stack, sample, np.zeros((stack.frames, 2)))
+        found = fit_white_balance(seen.values / exposures, seen.whole, patterns, program, known)
+        if found is None or (known is not None and np.abs(found / known - 1).max() < SETTLED):
+            return
+        stack.annotate(white_balance=found.round(5).tolist())
+        calibrate(stack, border)
+
+
 def _border_light(stack: Stack, border: BorderValues | None) -> BorderLight | None:
     """The light of a film's border, if its exposure was locked.
 
@@ -109,4 +141,4 @@ def _border_light(stack: Stack, border: BorderValues | None) -> BorderLight | No
     """
     if border is None or is_free(stack.attributes["auto_exposure"]):
         return None
-    return border.fit(look_up_of(stack), local_gain(stack))
+    return border.fit(look_up_of(stack), local_gain(stack), white_balance_of(stack.attributes))

@@ -93,6 +93,12 @@ def cases(attributes: dict[str, Any]) -> list[tuple[dict[str, Any], str, str | N
         (film | exposed(0.9, 1.0), "auto_exposure", "warning", "lock exposure"),
         (film | exposed(1.0, 1.3), "auto_exposure", "bad", "followed only in part"),
         (exposed(1.0, 1.3), "auto_exposure", "bad", "by hand for all stills: so large"),
+        (
+            {"white_balance": [[1.06, 1.0, 0.94], *np.ones((frames - 1, 3)).tolist()]},
+            "white_balance",
+            "warning",
+            "lock white balance",
+        ),
         ({"crosstalk": [[1, 0.35, 0], [0, 1, 0], [0, 0, 1]]}, "crosstalk", "warning", ""),
         ({"scaled": True}, "scaling", "warning", "Ctrl+0"),
         ({"survey": survey | {"deviation": survey["contrast"] / 20}}, "noise", "warning", "expose longer"),

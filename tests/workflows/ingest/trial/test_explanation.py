@@ -16,6 +16,7 @@ def measured(exposed: list[float] | None = None, masked: bool = False) -> Stack:
     attributes = dict.fromkeys(explanation.MEASURED, 0.0) | {
         "auto_exposure": exposed,
         "tone_mapping": None,
+        "white_balance": None,
         "monitor_curve": "srgb",
         "camera_curve": "srgb",
         "scaled": False,
@@ -26,6 +27,7 @@ def measured(exposed: list[float] | None = None, masked: bool = False) -> Stack:
         annotate=lambda **found: attributes.update(found),
         dtype=np.dtype(np.uint8),
         frames=2,
+        channels=1,
         images=list,
         mask=lambda: np.array([True, not masked]),
     )
@@ -45,7 +47,7 @@ def test_border_tells_tone_mapping_if_the_exposure_was_locked(
     monkeypatch: pytest.MonkeyPatch, border: bool, exposed: list[float] | None, asked: bool
 ) -> None:
     taken: list[Any] = []
-    values: Any = SimpleNamespace(fit=lambda look_up, local: "light of the border")
+    values: Any = SimpleNamespace(fit=lambda *given: "light of the border")
     monkeypatch.setattr(
         explanation,
         "find_unexplained",
@@ -105,7 +107,7 @@ def test_tone_mapping_that_explains_nothing_is_left_out_unless_the_border_tells_
     monkeypatch.setattr(explanation, "find_tone_mapping", find_tone_mapping)
     monkeypatch.setattr(explanation, "find_unexplained", find_unexplained)
     monkeypatch.setattr(explanation, "find_covered", lambda *given: False)
-    values: Any = SimpleNamespace(fit=lambda look_up, local: "light of the border") if border else None
+    values: Any = SimpleNamespace(fit=lambda *given: "light of the border") if border else None
     monkeypatch.setattr(explanation, "local_gain", lambda stack: None)
     explained = explanation.explain(stack, preset("sketch", 320, 240), cast(Any, None), values)
     assert explained is not None
