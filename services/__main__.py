@@ -5,9 +5,8 @@ import signal
 
 def run() -> None:
     """Run a command. Until its modules are imported, Ctrl-C ends the process at once, without a traceback."""
-    if (
-        signal.getsignal(signal.SIGINT) == signal.default_int_handler
-    ):  # a shell has it ignored in the background
+    # A shell has it ignored in the background.
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from services.cli.main import run
 
