@@ -49,14 +49,10 @@ NODES = nodes.FILES | live_module.FILES
 OF_PLATE = ("stmap.exr", "blender.py", "nuke.nk", "nuke_stmap.nk")
 """The files that can take a plate of the frame."""
 AS_FIT = "By default {}, and of a large frame as many as take 1 GiB before they are compressed."
+OF_LOBES = "The most lobes of a pixel; further ones are merged into these."
 Lobes = Annotated[
     int | None,
-    Query(
-        ge=1,
-        le=layers.MOST_LOBES,
-        description="The most lobes of a pixel; further ones are merged into these. "
-        + AS_FIT.format(layers.LOBES),
-    ),
+    Query(ge=1, le=layers.MOST_LOBES, description=f"{OF_LOBES} {AS_FIT.format(layers.LOBES)}"),
 ]
 Lookups = Annotated[
     int | None,
@@ -75,7 +71,7 @@ OverPlate = Annotated[
     ),
 ]
 BLOCK_BYTES = 32 << 20
-"""What an answer takes beside a layer's values: a block of the matte, above all."""
+"""What an answer takes beside a pixel, or beside a layer's values: a block of the matte, above all."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from services.api.context import Context, OwnerContext
 from services.api.http.responses import bytes_response
 from services.api.http.router import Router
 from services.api.http.types import Colour, Pair
+from services.api.mattes.layers import BLOCK_BYTES, OF_LOBES
 from storage.layout.mattes import Matte
 from storage.records import mattes
 from workflows.mattes.layers import LOBES, MOST_LOBES
@@ -21,12 +22,7 @@ from workflows.mattes.pixel_picture import picture
 router = Router(tags=["mattes"])
 MOST_CELLS = 10_000
 """Cells of one answer, some 2 MB."""
-LOOK_BYTES = 32 << 20
-"""What an answer takes beside a pixel: a block of the matte, above all."""
-Lobes = Annotated[
-    int,
-    Query(ge=1, le=MOST_LOBES, description="The most lobes of a pixel; further ones are merged into these."),
-]
+Lobes = Annotated[int, Query(ge=1, le=MOST_LOBES, description=OF_LOBES)]
 Cells = Annotated[int, Query(ge=0, le=MOST_CELLS, description="The most cells to list.")]
 Skip = Annotated[int, Query(ge=0, le=1 << 32, description="Cells to leave out, the heaviest first.")]
 X = Annotated[int, Query(description="The pixel's column, from 0 at the left.")]
@@ -126,7 +122,7 @@ async def _look(
     def measure() -> tuple[Matte, int]:
         with context.stored(mattes.get_ready, id):
             matte = context.cache.matte(id)
-            return matte, LOOK_BYTES + bytes_of_pixel(matte, *place)
+            return matte, BLOCK_BYTES + bytes_of_pixel(matte, *place)
 
     def look() -> Response:
         with context.stored(mattes.get_ready, id):
